@@ -1,0 +1,117 @@
+"""Photographs as every plugin sees them: 256 x 256 RGB, by one rule.
+
+The rule: EXIF rotation is applied; transparency is laid over white; one channel is repeated three times; 16 bits are scaled to 8;
+the largest centred square is cut out and resized to 256 x 256 with Pillow's bicubic filter, which averages when it shrinks.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageOps
+
+from bench.errors import UnitError, UserError
+from bench.types import Bytes
+
+SIDE = 256  # pixels
+SMALLEST = 32  # pixels; less cannot be called a photograph
+SUFFIXES = {".jpg", ".jpeg", ".png", ".webp"}
+
+
+@dataclass(frozen=True)
+class Source:
+    """A photograph that has not been read yet."""
+
+    name: str
+    path: Path
+
+    def content_hash(self) -> str:
+        return "sha256:" + hashlib.sha256(self.path.read_bytes()).hexdigest()
+
+
+@dataclass(frozen=True, eq=False)
+class Photograph:
+    """(256, 256, 3) uint8 RGB, and what had to be done to it that a reader should know."""
+
+    pixels: Bytes
+    notes: tuple[str, ...] = ()
+
+
+def folder(directory: Path) -> list[Source]:
+    """The JPEG, PNG and WebP files of a folder and its subfolders, by name.
+
+    Raises
+    ------
+    UserError
+        if it is no folder, or holds no photograph.
+    """
+    if not directory.is_dir():
+        raise UserError(f"--images {directory}: no such folder")
+    files = sorted(path for path in directory.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file())
+    if not files:
+        raise UserError(f"--images {directory}: no photograph in it (looked for {', '.join(sorted(SUFFIXES))})")
+    return [Source(path.relative_to(directory).as_posix(), path) for path in files]
+
+
+def builtin() -> list[Source]:
+    """The seven colour photographs that scikit-image and scikit-learn carry in their wheels."""
+    import skimage.data
+    import sklearn.datasets
+
+    scikit_image = Path(skimage.data.__file__).parent
+    scikit_learn = Path(sklearn.datasets.__file__).parent / "images"
+    names = ["astronaut.png", "chelsea.png", "coffee.png", "rocket.jpg", "motorcycle_left.png"]
+    files = [scikit_image / name for name in names] + [scikit_learn / name for name in ("china.jpg", "flower.jpg")]
+    return [Source(path.stem, path) for path in files]
+
+
+def read(path: Path) -> Photograph:
+    """Read one photograph by the module's rule.
+
+    Raises
+    ------
+    UnitError
+        if the file cannot be decoded, or is smaller than 32 pixels on a side.
+    """
+    image, notes = decode(path)
+    return Photograph(square(image, SIDE), notes)
+
+
+def decode(path: Path) -> tuple[Image.Image, tuple[str, ...]]:
+    """Return an upright 8-bit RGB image of the file's own size, and notes on what was converted."""
+    try:
+        with Image.open(path) as opened:
+            opened.load()
+            image = ImageOps.exif_transpose(opened)
+    except Image.DecompressionBombError as error:
+        raise UnitError(f"{path.name}: too many pixels to be read safely ({error})") from error
+    except (OSError, SyntaxError, ValueError) as error:
+        # Pillow says "image file is truncated", "cannot identify image file", ...
+        raise UnitError(f"{path.name}: cannot be read as an image: {error}") from error
+    if min(image.size) < SMALLEST:
+        raise UnitError(
+            f"{path.name}: {image.width} x {image.height} pixels; at least {SMALLEST} x {SMALLEST} are needed"
+        )
+    notes = []
+    if image.mode.startswith("I") or image.mode == "F":
+        notes.append(f"{path.name}: 16 bits a channel, scaled to 8")
+        deep = np.asarray(image, dtype=np.float64)
+        image = Image.fromarray(np.clip(np.rint(deep / 257.0), 0, 255).astype(np.uint8))
+    if "A" in image.getbands() or "transparency" in image.info:
+        notes.append(f"{path.name}: transparency, laid over white")
+        rgba = image.convert("RGBA")
+        image = Image.alpha_composite(Image.new("RGBA", rgba.size, "white"), rgba)
+    if image.mode in ("L", "LA", "1"):
+        notes.append(f"{path.name}: grey, its one channel serves as red, green and blue")
+    return image.convert("RGB"), tuple(notes)
+
+
+def square(image: Image.Image, side: int) -> Bytes:
+    """Cut out the largest centred square and resize it. -> (side, side, 3) uint8"""
+    short = min(image.size)
+    left, top = (image.width - short) // 2, (image.height - short) // 2
+    box = (left, top, left + short, top + short)
+    return np.array(image.resize((side, side), Image.Resampling.BICUBIC, box=box))

@@ -1,0 +1,1 @@
+"""Extractors, one file each, and dictionaries of descriptors."""

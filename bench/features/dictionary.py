@@ -1,0 +1,62 @@
+"""Dictionaries of descriptors: the K of LDP-Feat, the W of affine lifting, the attacker's Z.
+
+Rows are in random order, fixed when the dictionary is built. Sub-database s of n, as affine lifting uses them, is the s-th of
+n runs of rows that are equally long to within one: rows floor(s K / n) up to floor((s + 1) K / n).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bench import tensorfile
+from bench.errors import UserError
+from bench.types import Bytes
+
+KIND = "dictionary"
+
+
+@dataclass(frozen=True, eq=False)
+class Dictionary:
+    """K distinct words, the photographs they were made from, and how."""
+
+    words: Bytes  # (K, D), no row zero, no row twice
+    meta: dict[str, Any]  # extractor, photographs (hashes), mean_cosine, seed, ...
+    digest: str
+
+    def __len__(self) -> int:
+        return len(self.words)
+
+    @property
+    def photographs(self) -> frozenset[str]:
+        """Content hashes of the photographs that the words were made from."""
+        return frozenset(self.meta["photographs"])
+
+    def sub_database(self, index: int, count: int) -> Bytes:
+        """The rows of sub-database `index` of `count`, by the rule at the top of this file."""
+        size = len(self.words)
+        return self.words[index * size // count : (index + 1) * size // count]
+
+
+def save(path: Path, words: Bytes, meta: dict[str, Any]) -> Dictionary:
+    return Dictionary(words, meta, tensorfile.save(path, KIND, {"words": words}, meta))
+
+
+def load(path: Path) -> Dictionary:
+    """Read a dictionary and verify it.
+
+    Raises
+    ------
+    UserError
+        if the file is damaged, or its words are not (K, 128) uint8.
+    """
+    arrays, meta, digest = tensorfile.load(path, KIND)
+    words = arrays.get("words", np.empty(0))
+    if words.dtype != np.uint8:
+        raise UserError(f"{path}: words are {words.dtype}, expected uint8")
+    if words.ndim != 2 or words.shape[1] != 128 or len(words) < 2:
+        raise UserError(f"{path}: words have shape {words.shape}, expected (K, 128) with K at least 2")
+    return Dictionary(words, meta, digest)

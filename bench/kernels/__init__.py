@@ -1,0 +1,1 @@
+"""Numerical kernels that several plugins share: pure functions of arrays."""

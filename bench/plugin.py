@@ -1,0 +1,154 @@
+"""The base classes of plugins. A plugin is one frozen, keyword-only dataclass whose typed fields are its whole configuration."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, Literal, final
+
+import numpy as np
+
+from bench.types import Features, Floats, Knowledge, Release, View
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from bench.public import Public
+
+
+class Asset(str):
+    """A field's type: `shipped`, or the path of a file. Records hold the content's hash instead of the name."""
+
+
+@dataclass(frozen=True)
+class Between:
+    """All real settings of a field from `low` to `high`."""
+
+    low: float
+    high: float
+
+    def sample(self, rng: np.random.Generator) -> float:
+        return float(rng.uniform(self.low, self.high))
+
+    def __contains__(self, value: object) -> bool:
+        return isinstance(value, (int, float)) and self.low <= value <= self.high
+
+    def __str__(self) -> str:
+        return f"{self.low:g} to {self.high:g}"
+
+
+@dataclass(frozen=True)
+class OneOf:
+    """The listed settings of a field."""
+
+    values: tuple[float | str, ...]
+
+    def sample(self, rng: np.random.Generator) -> float | str:
+        return self.values[rng.integers(len(self.values))]
+
+    def __contains__(self, value: object) -> bool:
+        return value in self.values
+
+    def __str__(self) -> str:
+        return ", ".join(map(str, self.values))
+
+
+@dataclass(frozen=True)
+class Privacy:
+    """What a defense promises of one descriptor."""
+
+    guarantee: str  # "none", "epsilon-ldp", ...
+    epsilon: float | None = None  # nats, of one descriptor; None where nothing is promised
+    log10_true: float | None = None  # log10 of the chance that the true word is in its set
+
+
+class Plugin(ABC):
+    """What every plugin has in common. Its name is its file's."""
+
+    @classmethod
+    def name(cls) -> str:
+        return cls.__module__.rpartition(".")[2].replace("_", "-")
+
+    @classmethod
+    def summary(cls) -> str:
+        """The first line of the docstring."""
+        return (cls.__doc__ or "").strip().partition("\n")[0]
+
+
+class Defense(Plugin):
+    """Turns the secret features into what leaves the phone."""
+
+    releases: ClassVar[type[Release]]
+    # The settings that one trained attacker serves. A network trained for this plugin sees them drawn at random.
+    serves: ClassVar[Mapping[str, Between | OneOf]] = {}
+
+    @abstractmethod
+    def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> Release:
+        """Return a release that shares no memory with the secret. All randomness comes from `rng`."""
+
+    @abstractmethod
+    def privacy(self, public: Public) -> Privacy:
+        """What is promised of one descriptor, and where it can be computed, the chance that it is told."""
+
+
+class Attack(Plugin):
+    """Sees a `View` and tries to undo the defense. Subclass `DescriptorAttack` or `ImageAttack`."""
+
+    accepts: ClassVar[tuple[type[Release], ...]]
+    needs: ClassVar[frozenset[Knowledge]] = frozenset()
+
+    def unsuited(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
+        """Why this attack, as configured, has nothing adapted to that defense; None if it has."""
+        return None
+
+    @final
+    def inapplicable(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
+        """Why this attack does not apply to that defense, decided by types and declarations; None if it does."""
+        if not issubclass(defense.releases, self.accepts):
+            accepted = " or ".join(kind.__name__ for kind in self.accepts)
+            return f"{self.name()} attacks {accepted}; {defense.name()} releases {defense.releases.__name__}"
+        return self.unsuited(defense, extractor, public)
+
+
+class DescriptorAttack(Attack):
+    """Recovers one descriptor a keypoint. Images are then made by the network for raw descriptors."""
+
+    @abstractmethod
+    def recover(self, view: View, rng: np.random.Generator) -> Floats:
+        """Return (N, D) float32 unit-norm estimates, in the order of the release's keypoints."""
+
+
+class ImageAttack(Attack):
+    """Recovers the photograph itself."""
+
+    @abstractmethod
+    def reconstruct(self, view: View, rng: np.random.Generator) -> Floats:
+        """Return an (H, W, 3) float32 RGB image in [0, 1] of the release's size."""
+
+
+class Metric(Plugin):
+    """A pure function of the truth and an estimate."""
+
+    compares: ClassVar[Literal["images", "descriptors"]]
+    unit: ClassVar[str]
+    range: ClassVar[tuple[float, float]]
+    higher_is_better_for: ClassVar[Literal["attacker", "defender"]]
+
+    @abstractmethod
+    def __call__(self, truth: Floats, estimate: Floats) -> float | None:
+        """Images are (H, W, 3) in [0, 1]; descriptors are (N, D). None where the value is not finite."""
+
+
+class Extractor(Plugin):
+    """Turns a photograph into `Features`."""
+
+    @abstractmethod
+    def extract(self, image: np.ndarray, source: Path | None = None) -> Features:
+        """Extract from an (H, W, 3) uint8 RGB image. `source` is the photograph's file, where it has one.
+
+        Raises
+        ------
+        UnitError
+            if there is no keypoint.
+        """

@@ -1,0 +1,73 @@
+"""What everyone knows: dictionaries and databases, and where each photograph's descriptors quantise to."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import OrderedDict
+from pathlib import Path
+
+
+from bench.errors import UserError
+from bench.features import dictionary
+from bench.features.dictionary import Dictionary
+from bench.kernels.search import nearest_rows
+from bench.types import Features, Indices
+
+ASSETS = Path(__file__).parent / "assets"
+
+# What an asset's name stands for in this distribution. The attacker's database is made from other photographs.
+SHIPPED = {"shipped": "dictionary.safetensors", "shipped-public": "public-database.safetensors"}
+
+
+class Public:
+    """Loads public assets once, and remembers the quantisation of what it has quantised.
+
+    `remembered` bounds the number of photographs whose quantisation is kept.
+    """
+
+    def __init__(self, remembered: int = 64) -> None:
+        self._dictionaries: dict[str, Dictionary] = {}
+        self._quantised: OrderedDict[str, Indices] = OrderedDict()
+        self._remembered = remembered
+
+    def dictionary(self, asset: str) -> Dictionary:
+        """The dictionary called `shipped` or `shipped-public`, or that of a file.
+
+        Raises
+        ------
+        UserError
+            if it is missing or damaged.
+        """
+        if asset not in self._dictionaries:
+            self._dictionaries[asset] = dictionary.load(dictionary_path(asset))
+        return self._dictionaries[asset]
+
+    def nearest_words(self, asset: str, features: Features) -> Indices:
+        """For each descriptor the word of greatest cosine, ties to the lowest index. -> (N,) int64"""
+        known = self.dictionary(asset)
+        queries = features.descriptors if features.codes is None else features.codes
+        key = hashlib.sha256(known.digest.encode() + str(queries.dtype).encode() + queries.tobytes()).hexdigest()
+        if key not in self._quantised:
+            self.remember(key, nearest_rows(queries, known.words))
+        self._quantised.move_to_end(key)
+        return self._quantised[key]
+
+    def remember(self, key: str, words: Indices) -> None:
+        self._quantised[key] = words
+        while len(self._quantised) > self._remembered:
+            self._quantised.popitem(last=False)
+
+    def forget(self) -> None:
+        """Drop every cache."""
+        self._dictionaries.clear()
+        self._quantised.clear()
+
+
+def dictionary_path(asset: str) -> Path:
+    """The file that an asset's name stands for."""
+    if asset in SHIPPED:
+        path = ASSETS / SHIPPED[asset]
+        if not path.is_file():
+            raise UserError(f"{path.name} is not part of this installation; reinstall, or name a file")
+        return path
+    return Path(asset)

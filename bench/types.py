@@ -1,0 +1,108 @@
+"""What flows through the benchmark: the secret `Features`, the three kinds of `Release`, and an attack's `View`.
+
+Shapes use N for keypoints, D for a descriptor's length, m for candidates a keypoint, dim for a subspace's dimension.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from bench.plugin import Defense, Extractor
+
+Floats = NDArray[np.float32]
+Bytes = NDArray[np.uint8]
+Indices = NDArray[np.int64]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Features:
+    """What the phone extracted from one photograph, and the only secret of the benchmark."""
+
+    keypoints: Floats  # (N, 2) x, y in pixels; the centre of the top-left pixel is (0.5, 0.5)
+    descriptors: Floats  # (N, D) unit norm
+    codes: Bytes | None  # (N, D) the 8-bit vectors that the descriptors came from, where there are any
+    size: tuple[int, int]  # width, height in pixels
+
+    def __len__(self) -> int:
+        return len(self.keypoints)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Release:
+    """What leaves the phone. The keypoints' positions and their number are released in the clear."""
+
+    keypoints: Floats  # (N, 2)
+    size: tuple[int, int]  # width, height
+
+    def __len__(self) -> int:
+        return len(self.keypoints)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Descriptors(Release):
+    """One descriptor a keypoint."""
+
+    descriptors: Floats  # (N, D)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Subspaces(Release):
+    """One affine subspace {origin + basisᵀ c} a keypoint."""
+
+    origins: Floats  # (N, D) a point of the subspace
+    bases: Floats  # (N, dim, D) orthonormal rows
+
+    @property
+    def dim(self) -> int:
+        return self.bases.shape[1]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class WordSets(Release):
+    """A set of m candidate descriptors a keypoint; the order of a row carries nothing."""
+
+    candidates: Floats  # (N, m, D) unit norm
+    words: Indices | None  # (N, m) rows of the dictionary, ascending; None where there is no dictionary
+
+    @property
+    def subset_size(self) -> int:
+        return self.candidates.shape[1]
+
+
+class Knowledge(Enum):
+    """What an attacker may have beside the release."""
+
+    DATABASE = "the database W that lifting drew its adversarial descriptors from"
+    PUBLIC_DATABASE = "a database Z of the attacker's own, from other photographs"
+    OTHER_RELEASES = "other releases made with the same database"
+    MAP = "the server's map"
+    TRAINING_IMAGES = "photographs to train an inversion network on"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class View:
+    """All that an attack may look at: the release, how it was made, and the knowledge that it declared to need."""
+
+    release: Release
+    defense: Defense  # its configuration is public; its randomness is not
+    extractor: Extractor
+    knowledge: Mapping[Knowledge, Callable[[], Any]] = field(default_factory=dict)
+
+    def know(self, what: Knowledge) -> Any:
+        """Return the knowledge `what`.
+
+        Raises
+        ------
+        PermissionError
+            if the attack did not list it in its `needs`.
+        """
+        if what not in self.knowledge:
+            raise PermissionError(f"this attack did not declare {what.name} in its `needs`")
+        return self.knowledge[what]()

@@ -1,0 +1,1 @@
+"""Everything a person sees, made from records alone."""
