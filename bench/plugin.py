@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Literal, final
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, final
 
 import numpy as np
 
-from bench.types import Features, Floats, Knowledge, Release, View
+from bench.types import Bytes, Features, Floats, Knowledge, Release
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -63,7 +63,7 @@ class Privacy:
     log10_true: float | None = None  # log10 of the chance that the true word is in its set
 
 
-class Plugin(ABC):
+class Plugin:
     """What every plugin has in common. Its name is its file's."""
 
     @classmethod
@@ -76,12 +76,14 @@ class Plugin(ABC):
         return (cls.__doc__ or "").strip().partition("\n")[0]
 
 
-class Defense(Plugin):
+class Defense(Plugin, ABC):
     """Turns the secret features into what leaves the phone."""
 
     releases: ClassVar[type[Release]]
     # The settings that one trained attacker serves. A network trained for this plugin sees them drawn at random.
     serves: ClassVar[Mapping[str, Between | OneOf]] = {}
+    # The field that names the dictionary by which descriptors are quantised, if they are.
+    quantised_by: ClassVar[str | None] = None
 
     @abstractmethod
     def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> Release:
@@ -92,7 +94,29 @@ class Defense(Plugin):
         """What is promised of one descriptor, and where it can be computed, the chance that it is told."""
 
 
-class Attack(Plugin):
+@dataclass(frozen=True, kw_only=True, eq=False)
+class View:
+    """All that an attack may look at: the release, how it was made, and the knowledge that it declared to need."""
+
+    release: Release
+    defense: Defense  # its configuration is public; its randomness is not
+    extractor: Extractor
+    knowledge: Mapping[Knowledge, Callable[[], Any]] = field(default_factory=dict)
+
+    def know(self, what: Knowledge) -> Any:
+        """Return the knowledge `what`.
+
+        Raises
+        ------
+        PermissionError
+            if the attack did not list it in its `needs`.
+        """
+        if what not in self.knowledge:
+            raise PermissionError(f"this attack did not declare {what.name} in its `needs`")
+        return self.knowledge[what]()
+
+
+class Attack(Plugin, ABC):
     """Sees a `View` and tries to undo the defense. Subclass `DescriptorAttack` or `ImageAttack`."""
 
     accepts: ClassVar[tuple[type[Release], ...]]
@@ -101,6 +125,10 @@ class Attack(Plugin):
     def unsuited(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
         """Why this attack, as configured, has nothing adapted to that defense; None if it has."""
         return None
+
+    def assets(self, defense: Defense, extractor: Extractor, public: Public) -> Mapping[str, str]:
+        """Field -> digest of the content that this attack would use against that defense; records hold it for the name."""
+        return {}
 
     @final
     def inapplicable(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
@@ -127,28 +155,86 @@ class ImageAttack(Attack):
         """Return an (H, W, 3) float32 RGB image in [0, 1] of the release's size."""
 
 
-class Metric(Plugin):
+class Metric(Plugin, ABC):
     """A pure function of the truth and an estimate."""
 
     compares: ClassVar[Literal["images", "descriptors"]]
     unit: ClassVar[str]
     range: ClassVar[tuple[float, float]]
     higher_is_better_for: ClassVar[Literal["attacker", "defender"]]
+    # What the formula leaves open, as records hold it.
+    parameters: ClassVar[Mapping[str, Any]] = {}
 
     @abstractmethod
     def __call__(self, truth: Floats, estimate: Floats) -> float | None:
         """Images are (H, W, 3) in [0, 1]; descriptors are (N, D). None where the value is not finite."""
 
 
-class Extractor(Plugin):
+class Extractor(Plugin, ABC):
     """Turns a photograph into `Features`."""
 
     @abstractmethod
     def extract(self, image: np.ndarray, source: Path | None = None) -> Features:
-        """Extract from an (H, W, 3) uint8 RGB image. `source` is the photograph's file, where it has one.
+        """Extract from an (H, W, 3) uint8 RGB image, in the order of `Features.by_position`.
+
+        `source` is the photograph's file, where it has one.
 
         Raises
         ------
         UnitError
             if there is no keypoint.
+        """
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Trial:
+    """One unit of one cell of the experiment: the truth, what was released of it, and who attacks."""
+
+    pixels: Bytes  # (H, W, 3) the photograph
+    secret: Features
+    release: Release
+    defense: Defense
+    attack: Attack | None  # None where the task judges the release itself
+    extractor: Extractor
+    public: Public
+    metrics: tuple[Metric, ...]
+    rng: np.random.Generator
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Outcome:
+    """How a trial ended."""
+
+    metrics: Mapping[str, float | None]
+    image: Floats | None = None  # (H, W, 3) in [0, 1], where one was made
+    notes: tuple[str, ...] = ()
+
+
+class Task(Plugin, ABC):
+    """What a release is judged by. The runner plans, resumes and records; a task does one trial at a time."""
+
+    attacked: ClassVar[bool]  # whether it judges what an attack makes of the release, and not the release itself
+
+    @abstractmethod
+    def inapplicable(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> str | None:
+        """Why there is nothing to judge in that pair; None if there is."""
+
+    @abstractmethod
+    def resolved(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> Mapping[str, Any]:
+        """What the attack would use of other plugins and files, with digests: merged into its recorded configuration.
+
+        Raises
+        ------
+        UserError
+            if something that it would use is missing or damaged.
+        """
+
+    @abstractmethod
+    def judge(self, trial: Trial) -> Outcome:
+        """Carry out one trial.
+
+        Raises
+        ------
+        UnitError
+            if it cannot be done.
         """

@@ -4,28 +4,33 @@ from __future__ import annotations
 
 import hashlib
 from collections import OrderedDict
+from collections.abc import Callable
 from pathlib import Path
-
 
 from bench.errors import UserError
 from bench.features import dictionary
 from bench.features.dictionary import Dictionary
-from bench.kernels.search import nearest_rows
-from bench.types import Features, Indices
+from bench.types import Bytes, Features, Floats, Indices
 
 ASSETS = Path(__file__).parent / "assets"
 
 # What an asset's name stands for in this distribution. The attacker's database is made from other photographs.
 SHIPPED = {"shipped": "dictionary.safetensors", "shipped-public": "public-database.safetensors"}
 
+Quantiser = Callable[[Dictionary, Bytes | Floats], Indices]
+
 
 class Public:
     """Loads public assets once, and remembers the quantisation of what it has quantised.
 
-    `remembered` bounds the number of photographs whose quantisation is kept.
+    Parameters
+    ----------
+    quantiser : finds the nearest words of (N, D) rows in a dictionary
+    remembered : number of photographs whose quantisation is kept
     """
 
-    def __init__(self, remembered: int = 64) -> None:
+    def __init__(self, quantiser: Quantiser = lambda known, rows: known.index.nearest(rows), remembered: int = 64) -> None:
+        self._quantiser = quantiser
         self._dictionaries: dict[str, Dictionary] = {}
         self._quantised: OrderedDict[str, Indices] = OrderedDict()
         self._remembered = remembered
@@ -43,19 +48,26 @@ class Public:
         return self._dictionaries[asset]
 
     def nearest_words(self, asset: str, features: Features) -> Indices:
-        """For each descriptor the word of greatest cosine, ties to the lowest index. -> (N,) int64"""
+        """For each descriptor the word of greatest cosine, ties to the lowest index. -> (N,) int64, a copy
+
+        Raises
+        ------
+        UserError
+            if the descriptors are not as long as the words.
+        """
         known = self.dictionary(asset)
         queries = features.descriptors if features.codes is None else features.codes
+        if queries.shape[1] != known.words.shape[1]:
+            raise UserError(f"the descriptors have length {queries.shape[1]}, the words of {asset} {known.words.shape[1]}")
         key = hashlib.sha256(known.digest.encode() + str(queries.dtype).encode() + queries.tobytes()).hexdigest()
-        if key not in self._quantised:
-            self.remember(key, nearest_rows(queries, known.words))
-        self._quantised.move_to_end(key)
-        return self._quantised[key]
-
-    def remember(self, key: str, words: Indices) -> None:
+        if key in self._quantised:
+            self._quantised.move_to_end(key)
+            return self._quantised[key].copy()
+        words = self._quantiser(known, queries)
         self._quantised[key] = words
         while len(self._quantised) > self._remembered:
             self._quantised.popitem(last=False)
+        return words.copy()
 
     def forget(self) -> None:
         """Drop every cache."""

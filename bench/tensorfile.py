@@ -60,7 +60,5 @@ def load(path: Path, kind: str) -> tuple[Arrays, dict[str, Any], str]:
     meta = json.loads(header["meta"])
     digest = content_digest(kind, arrays, meta)
     if digest != header.get("digest"):
-        raise UserError(
-            f"{path}: its checksum is {digest}, but {header.get('digest')} was written; fetch or build it again"
-        )
+        raise UserError(f"{path}: its checksum is {digest}, but {header.get('digest')} was written; fetch or build it again")
     return arrays, meta, digest

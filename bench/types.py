@@ -1,20 +1,15 @@
-"""What flows through the benchmark: the secret `Features`, the three kinds of `Release`, and an attack's `View`.
+"""What flows through the benchmark: the secret `Features`, the three kinds of `Release`, and what an attacker may know.
 
 Shapes use N for keypoints, D for a descriptor's length, m for candidates a keypoint, dim for a subspace's dimension.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import Enum
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-if TYPE_CHECKING:
-    from bench.plugin import Defense, Extractor
 
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
@@ -32,6 +27,19 @@ class Features:
 
     def __len__(self) -> int:
         return len(self.keypoints)
+
+    def by_position(self) -> Features:
+        """The same features from top to bottom, then from left to right.
+
+        Extractors find strong keypoints first, and strength is not released: in their order it would be.
+        """
+        order = np.lexsort((self.keypoints[:, 0], self.keypoints[:, 1]))
+        return Features(
+            keypoints=self.keypoints[order],
+            descriptors=self.descriptors[order],
+            codes=None if self.codes is None else self.codes[order],
+            size=self.size,
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -84,25 +92,3 @@ class Knowledge(Enum):
     OTHER_RELEASES = "other releases made with the same database"
     MAP = "the server's map"
     TRAINING_IMAGES = "photographs to train an inversion network on"
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class View:
-    """All that an attack may look at: the release, how it was made, and the knowledge that it declared to need."""
-
-    release: Release
-    defense: Defense  # its configuration is public; its randomness is not
-    extractor: Extractor
-    knowledge: Mapping[Knowledge, Callable[[], Any]] = field(default_factory=dict)
-
-    def know(self, what: Knowledge) -> Any:
-        """Return the knowledge `what`.
-
-        Raises
-        ------
-        PermissionError
-            if the attack did not list it in its `needs`.
-        """
-        if what not in self.knowledge:
-            raise PermissionError(f"this attack did not declare {what.name} in its `needs`")
-        return self.knowledge[what]()

@@ -56,6 +56,31 @@ def folder(directory: Path) -> list[Source]:
     return [Source(path.relative_to(directory).as_posix(), path) for path in files]
 
 
+def held_out(sources: list[Source], chosen: Path | None) -> tuple[list[Source], list[Source]]:
+    """Part photographs into those to train on and those to validate on.
+
+    `chosen` is a folder of others, or a text file with the names of those of `sources` to hold out, one a line; None holds out
+    every twentieth.
+
+    Raises
+    ------
+    UserError
+        if `chosen` does not exist, or names none of them.
+    """
+    if chosen is not None and chosen.is_dir():
+        return sources, folder(chosen)
+    if chosen is None:
+        names = {source.name for source in sources[::20]}
+    elif chosen.is_file():
+        names = set(chosen.read_text(encoding="utf-8").split("\n"))
+    else:
+        raise UserError(f"{chosen}: no such folder or file")
+    validation = [source for source in sources if source.name in names]
+    if not validation:
+        raise UserError(f"{chosen}: names none of the photographs")
+    return [source for source in sources if source.name not in names], validation
+
+
 def builtin() -> list[Source]:
     """The seven colour photographs that scikit-image and scikit-learn carry in their wheels."""
     import skimage.data
@@ -92,9 +117,7 @@ def decode(path: Path) -> tuple[Image.Image, tuple[str, ...]]:
         # Pillow says "image file is truncated", "cannot identify image file", ...
         raise UnitError(f"{path.name}: cannot be read as an image: {error}") from error
     if min(image.size) < SMALLEST:
-        raise UnitError(
-            f"{path.name}: {image.width} x {image.height} pixels; at least {SMALLEST} x {SMALLEST} are needed"
-        )
+        raise UnitError(f"{path.name}: {image.width} x {image.height} pixels; at least {SMALLEST} x {SMALLEST} are needed")
     notes = []
     if image.mode.startswith("I") or image.mode == "F":
         notes.append(f"{path.name}: 16 bits a channel, scaled to 8")
@@ -114,4 +137,4 @@ def square(image: Image.Image, side: int) -> Bytes:
     short = min(image.size)
     left, top = (image.width - short) // 2, (image.height - short) // 2
     box = (left, top, left + short, top + short)
-    return np.array(image.resize((side, side), Image.Resampling.BICUBIC, box=box))
+    return np.array(image.crop(box).resize((side, side), Image.Resampling.BICUBIC))

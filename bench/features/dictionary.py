@@ -7,6 +7,7 @@ n runs of rows that are equally long to within one: rows floor(s K / n) up to fl
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import numpy as np
 
 from bench import tensorfile
 from bench.errors import UserError
+from bench.kernels.search import WordIndex
 from bench.types import Bytes
 
 KIND = "dictionary"
@@ -34,6 +36,11 @@ class Dictionary:
     def photographs(self) -> frozenset[str]:
         """Content hashes of the photographs that the words were made from."""
         return frozenset(self.meta["photographs"])
+
+    @cached_property
+    def index(self) -> WordIndex:
+        """Finds the nearest words of descriptors."""
+        return WordIndex(self.words)
 
     def sub_database(self, index: int, count: int) -> Bytes:
         """The rows of sub-database `index` of `count`, by the rule at the top of this file."""

@@ -22,9 +22,7 @@ class Sift(Extractor):
     """
 
     upright: bool = True
-    contrast_threshold: float = (
-        0.002  # lower than OpenCV's .04: 256 x 256 pixels shall give about 600 to 1,000 keypoints
-    )
+    contrast_threshold: float = 0.002  # lower than OpenCV's .04: 256 x 256 pixels shall give about 600 to 1,000 keypoints
     edge_threshold: float = 15.0
     max_keypoints: int = 1000  # those of strongest response
 
@@ -35,7 +33,7 @@ class Sift(Extractor):
     def extract(self, image: np.ndarray, source: Path | None = None) -> Features:
         import cv2
 
-        sift = cv2.SIFT_create(
+        sift = cv2.SIFT_create(  # type: ignore[attr-defined]
             contrastThreshold=self.contrast_threshold, edgeThreshold=self.edge_threshold, enable_precise_upscale=True
         )
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
@@ -48,10 +46,11 @@ class Sift(Extractor):
             raise UnitError("no keypoint was found: is the image flat?")
         points, values = sift.compute(grey, points)
         codes = values.astype(np.uint8)  # OpenCV rounds to 0..255 and hands them out as float32
-        keep = codes.any(axis=1)
         xy = np.array([point.pt for point in points], dtype=np.float32) + 0.5  # OpenCV's centre of the first pixel is 0
+        keep = codes.any(axis=1)
         height, width = grey.shape
-        return Features(keypoints=xy[keep], descriptors=unit_rows(codes[keep]), codes=codes[keep], size=(width, height))
+        found = Features(keypoints=xy[keep], descriptors=unit_rows(codes[keep]), codes=codes[keep], size=(width, height))
+        return found.by_position()
 
 
 def _once_each(points: list) -> list:

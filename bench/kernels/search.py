@@ -1,4 +1,4 @@
-"""Exact search for the word of greatest cosine: a bf16 pass over blocks finds where it can be, float64 decides.
+"""Exact search for the word of greatest cosine: a bf16 pass finds which words it can be, float64 decides among them.
 
 Floor: 2·N·K·D operations at the machine's bf16 matrix rate; the words are read once for each batch of queries.
 """
@@ -11,70 +11,78 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bench.device import pick_device
+from bench.device import pick_device, pick_dtype
 from bench.types import Bytes, Floats, Indices
 
 BLOCK = 2048  # words in a block: a block and its scores stay in the cache
 BATCH = 512  # queries that share one reading of the words
 
-# Cosines of unit vectors err by at most 2^-9 from rounding each factor and 2^-9 from rounding the result to bf16
-# (2^-9 relative each, Cauchy-Schwarz over the sum), so two scores whose order a bf16 pass got wrong differ by less than this.
-_MARGIN = 2 * 3 * 2.0**-9 + 1e-4
+# How far below the greatest approximate cosine the true one can be. A rounding errs by half a unit in the last place, for bf16
+# by 2^-9 of the number; there are three, of both factors and of the result; two scores are compared; Cauchy-Schwarz bounds sums.
+MARGIN = {torch.bfloat16: 2 * 3 * 2.0**-9 + 1e-4, torch.float32: 1e-4}
 
 
 def unit_rows(rows: Bytes | Floats) -> Floats:
-    """Scale each row to unit norm in float64 and return float32; a row of zeros stays zero. (N, D) -> (N, D)"""
+    """Scale each row to unit norm in float64 and return float32; a row of zeros stays zero. (..., D) -> (..., D)"""
     exact = rows.astype(np.float64)
     norms = np.linalg.norm(exact, axis=-1, keepdims=True)
     return (exact / np.where(norms > 0, norms, 1.0)).astype(np.float32)
 
 
-def nearest_rows(queries: Bytes | Floats, words: Bytes, *, progress: Callable[[int], object] | None = None) -> Indices:
-    """Return for each query the index of the word of greatest cosine, ties to the lowest index.
+class WordIndex:
+    """(K, D) uint8 words, none zero, made ready to be searched."""
 
-    Parameters
-    ----------
-    queries : (N, D) uint8 or float32, of any norm
-    words : (K, D) uint8, no row zero
-    progress : called with the number of queries just done
+    def __init__(self, words: Bytes) -> None:
+        device = pick_device()
+        self._dtype = pick_dtype(device)
+        self._words = words
+        self._coarse = torch.from_numpy(unit_rows(words)).to(device, self._dtype)  # (K, D)
 
-    Returns
-    -------
-    (N,) int64. Scores are compared in float64; dot products of uint8 rows are exact in it.
-    """
-    device = pick_device()
-    # (K, D) unit words in bf16 for the pass that only narrows down
-    coarse = torch.from_numpy(unit_rows(words)).to(device, torch.bfloat16)
-    exact = torch.from_numpy(words)
-    norms = torch.linalg.vector_norm(exact.double(), dim=1)
-    found = np.empty(len(queries), dtype=np.int64)
-    for start in range(0, len(queries), BATCH):
-        batch = queries[start : start + BATCH]
-        tops = _block_maxima(torch.from_numpy(unit_rows(batch)).to(device, torch.bfloat16), coarse)
-        found[start : start + BATCH] = _decide(torch.from_numpy(batch).double(), exact, norms, tops.cpu())
-        if progress is not None:
+    def nearest(self, queries: Bytes | Floats, progress: Callable[[int], object] = lambda done: None) -> Indices:
+        """Return for each query the index of the word of greatest cosine, ties to the lowest index.
+
+        Parameters
+        ----------
+        queries : (N, D) uint8 or float32, of any norm
+        progress : called with the number of queries just done
+
+        Returns
+        -------
+        (N,) int64. Cosines are compared as dot² / |word|² in float64; uint8 rows have exact dot products in it.
+        """
+        found = np.empty(len(queries), dtype=np.int64)
+        for start in range(0, len(queries), BATCH):
+            batch = queries[start : start + BATCH]
+            coarse = torch.from_numpy(unit_rows(batch)).to(self._coarse.device, self._dtype)
+            found[start : start + BATCH] = self._decide(batch, *self._possible(coarse))
             progress(len(batch))
-    return found
+        return found
+
+    def _possible(self, queries: Tensor) -> tuple[np.ndarray, np.ndarray]:
+        """Pairs of a query and a word that may be its nearest. (n, D) -> (P,), (P,)"""
+        blocks = self._coarse.split(BLOCK)
+        tops = torch.stack([block_maxima(queries, block) for block in blocks], dim=1).float()  # (n, blocks)
+        least = tops.amax(dim=1) - MARGIN[self._dtype]  # (n,)
+        rows, words = [], []
+        for number, block in enumerate(blocks):
+            near = (tops[:, number] >= least).nonzero()[:, 0]
+            if len(near):
+                row, word = (queries[near] @ block.T >= least[near, None]).nonzero(as_tuple=True)
+                rows.append(near[row])
+                words.append(word + number * BLOCK)
+        return torch.cat(rows).cpu().numpy(), torch.cat(words).cpu().numpy()
+
+    def _decide(self, queries: Bytes | Floats, rows: np.ndarray, words: np.ndarray) -> np.ndarray:
+        """Of the possible words of each query the one of greatest cosine. (n, D), (P,), (P,) -> (n,)"""
+        exact = self._words[words].astype(np.float64)  # (P, D)
+        dots = np.einsum("pd,pd->p", queries[rows].astype(np.float64), exact)
+        # Words of one direction must compare equal: the squares of integers divide to one and the same double.
+        scores = dots * np.abs(dots) / np.einsum("pd,pd->p", exact, exact)
+        order = np.lexsort((words, -scores, rows))
+        first = np.unique(rows[order], return_index=True)[1]
+        return words[order][first]
 
 
-def _block_maxima(queries: Tensor, words: Tensor) -> Tensor:
-    """Greatest approximate cosine of each query in each block of words. (N, D), (K, D) -> (N, blocks)"""
-    return torch.stack([(queries @ block.T).amax(dim=1) for block in words.split(BLOCK)], dim=1).float()
-
-
-def _decide(queries: Tensor, words: Tensor, norms: Tensor, tops: Tensor) -> np.ndarray:
-    """Compare in float64, within the blocks that can hold the greatest cosine."""
-    possible = tops >= tops.amax(dim=1, keepdim=True) - _MARGIN  # (N, blocks)
-    best = torch.full((len(queries),), -torch.inf, dtype=torch.float64)
-    index = torch.zeros(len(queries), dtype=torch.int64)
-    for block in range(tops.shape[1]):
-        rows = possible[:, block].nonzero()[:, 0]
-        if len(rows) == 0:
-            continue
-        start = block * BLOCK
-        scores = queries[rows] @ words[start : start + BLOCK].double().T / norms[start : start + BLOCK]
-        value, place = scores.max(dim=1)  # ties to the lowest index, as the blocks ascend
-        better = value > best[rows]
-        best[rows] = torch.where(better, value, best[rows])
-        index[rows] = torch.where(better, place + start, index[rows])
-    return index.numpy()
+def block_maxima(queries: Tensor, block: Tensor) -> Tensor:
+    """Greatest approximate cosine of each query in one block of words. (n, D), (b, D) -> (n,)"""
+    return (queries @ block.T).amax(dim=1)

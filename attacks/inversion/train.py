@@ -1,0 +1,297 @@
+"""Trains the network that an attacker would, for the releases of one defense.
+
+The data of a step are a function of (seed, step) alone, so that a resumed training is the same training.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from attacks.inversion import weights
+from attacks.inversion.data import Example, Examples, Served, fitting_dictionaries, quantisation_error, quantise
+from attacks.inversion.encoding import Points, encode, stack
+from attacks.inversion.loss import reconstruction_loss, ssim
+from attacks.inversion.network import Inverter, Shape, paint
+from bench import tensorfile
+from bench.datasets.photographs import SIDE, Source
+from bench.device import pick_device, pick_dtype
+from bench.errors import UserError
+from bench.features.views import PhotographView, collect
+from bench.plugin import Asset, Defense, Extractor, OneOf
+from bench.progress import Progress
+from bench.public import Public
+from bench.types import WordSets
+
+CHECKPOINT = "inversion-checkpoint"
+CHECKPOINT_EVERY = 250  # steps
+VALIDATE_AT_MOST = 100  # photographs
+TOLERANCE = 0.05  # between the quantisation errors on training and on unseen photographs
+
+
+@dataclass(frozen=True, kw_only=True)
+class Training:
+    """How long and how fast."""
+
+    steps: int = 4000
+    batch: int = 8
+    rate: float = 2e-3  # AdamW's learning rate at its peak; cosine to zero
+    warmup: int = 100  # steps
+    decay: float = 0.02  # AdamW's weight decay
+    average: float = 0.998  # decay of the moving average of the weights
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.steps < 1 or self.batch < 1:
+            raise UserError(f"training needs at least one step of one photograph, got {self.steps} of {self.batch}")
+
+
+def train(
+    defense: Defense,
+    served: Served,
+    *,
+    photographs: Sequence[Source],
+    validation: Sequence[Source],
+    out: Path,
+    extractor: Extractor,
+    crossfit: Sequence[Asset] = (),
+    start: Path | None = None,
+    training: Training = Training(),  # frozen
+) -> dict[str, Any]:
+    """Train, or resume, a network for the releases of `defense`, and return its metadata. What is done is not done again.
+
+    Parameters
+    ----------
+    defense : the settings that are fixed
+    served : fields whose settings are drawn at random in training; one network serves them all
+    photographs, validation : no photograph should be in both
+    out : the weights' file; a checkpoint is kept beside it until training is done
+    crossfit : dictionaries for photographs that helped to make the defense's own
+    start : weights of a network for raw descriptors to start from; random ones if None
+
+    Raises
+    ------
+    UserError
+        if photographs are in both sets, no photograph can be used, or `out` or its checkpoint is of another training.
+    """
+    shared = {source.content_hash() for source in photographs} & {source.content_hash() for source in validation}
+    if shared:
+        raise UserError(f"{len(shared)} photographs are in both the training and the validation set")
+    views, unseen = collect(list(photographs), extractor), collect(list(validation), extractor)
+    unseen = [view for view in unseen if len(view.pixels) == SIDE][::2]  # not the mirrored ones
+    examples, held_out, errors = _examples(defense, served, views, unseen, crossfit)
+    slots = _slots(defense, examples, views[0])
+    sample = encode([(first := held_out.whole(unseen[0], np.random.default_rng(0))).release], [first.condition], slots)
+    shape = Shape(inputs=sample.values.shape[1])
+    meta = {
+        **weights.describe(defense, dict(served), extractor, Public()),
+        "slots": slots,
+        "start": None if start is None else weights.load(start).digest,
+        "photographs": len({view.photograph for view in views}),
+        "crops": training.steps * training.batch,
+        "batch": training.batch,
+        "rate": training.rate,
+        "seed": training.seed,
+        "quantisation_error": errors,
+    }
+    if out.exists():
+        done = weights.load(out).meta
+        _same_training(out, done, meta)
+        return done
+    trainer = _Trainer(shape, training, out, meta)
+    if start is not None and trainer.step == 0:
+        trainer.start_from(weights.load(start).module, slots if defense.releases is WordSets else 1)
+    module = trainer.run(examples, slots)
+    meta["validation"] = validate(module, held_out, unseen[:VALIDATE_AT_MOST], slots)
+    weights.save(out, module, shape, meta)
+    _checkpoint_path(out).unlink(missing_ok=True)
+    return meta
+
+
+def _same_training(path: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
+    """Refuse to go on with, or to overwrite, what another training left."""
+    changed = [key for key in wanted if found.get(key) != wanted[key]]
+    if changed:
+        raise UserError(f"{path} is of another training (other {', '.join(changed)}); remove it, or name another --out")
+
+
+def _examples(
+    defense: Defense, served: Served, views: list[PhotographView], unseen: list[PhotographView], crossfit: Sequence[Asset]
+) -> tuple[Examples, Examples, dict[str, float] | None]:
+    """Training and validation examples, and the quantisation error on both where descriptors are quantised."""
+    if defense.quantised_by is None:
+        return Examples(views, defense, served, {}, Public()), Examples(unseen, defense, served, {}, Public()), None
+    own = Asset(getattr(defense, defense.quantised_by))
+    plain = Public()
+    chosen = fitting_dictionaries({view.photograph for view in views}, [own, *crossfit], plain)
+    chosen_unseen = fitting_dictionaries({view.photograph for view in unseen}, [own], plain)
+    public = Public(quantise(views, chosen, plain), remembered=0)
+    examples, held_out = Examples(views, defense, served, chosen, public), Examples(unseen, defense, served, chosen_unseen, plain)
+    upright = [view for view in views if len(view.pixels) == SIDE][::2]
+    errors = {
+        "training": quantisation_error(upright, chosen, public),
+        "validation": quantisation_error(unseen, chosen_unseen, plain),
+    }
+    check_quantisation(errors["training"], errors["validation"])
+    return examples, held_out, errors
+
+
+def check_quantisation(training: float, validation: float) -> None:
+    """Refuse a training set that the dictionary knows: an attacker who is trained on it makes the defense look safer than it is.
+
+    Raises
+    ------
+    UserError
+        if the quantisation error on the two sets of photographs differs by more than 5%.
+    """
+    if not abs(training - validation) <= TOLERANCE * validation:
+        raise UserError(
+            f"training photographs are {training:.4f} away from their words, unseen ones {validation:.4f}: more than "
+            f"{TOLERANCE:.0%} apart, so the network would learn to trust words as it must not. Were the training photographs "
+            "part of the dictionary? If not, give more photographs to --validation"
+        )
+
+
+def _slots(defense: Defense, examples: Examples, view: PhotographView) -> int:
+    """The most candidates a keypoint among the served settings: the greatest setting of each field, the others at theirs."""
+    most = {field: max(setting.values) for field, setting in examples.served.items() if isinstance(setting, OneOf)}
+    fixed = {field: OneOf((value,)) for field, value in most.items()}
+    largest = Examples(examples.views, defense, {**examples.served, **fixed}, examples.dictionaries, examples.public)
+    return stack(largest.whole(view, np.random.default_rng(0)).release).shape[1]
+
+
+def _checkpoint_path(out: Path) -> Path:
+    return out.with_name(out.name + ".checkpoint")
+
+
+class _Trainer:
+    """Weights, their moving average, AdamW's state and the number of steps done: what a checkpoint holds."""
+
+    def __init__(self, shape: Shape, training: Training, out: Path, meta: dict[str, Any]) -> None:
+        torch.manual_seed(training.seed)
+        self.training, self.meta = training, meta
+        self.device = pick_device()
+        self.dtype = pick_dtype(self.device)
+        self.path = _checkpoint_path(out)
+        self.module = Inverter(shape).to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.average = {name: value.clone() for name, value in self.module.state_dict().items()}
+        self.optimizer = torch.optim.AdamW(self.module.parameters(), training.rate, weight_decay=training.decay)
+        self.step = 0
+        if self.path.is_file():
+            self._restore()
+
+    def start_from(self, trained: Inverter, candidates: int) -> None:
+        """Take over a network for raw descriptors."""
+        weights.start_from(self.module, trained, candidates)
+        self.average = {name: value.clone() for name, value in self.module.state_dict().items()}
+
+    def run(self, examples: Examples, slots: int) -> Inverter:
+        """Train to the end and return the network with averaged weights."""
+        if self.step == self.training.steps:
+            return self._averaged()
+        with Progress("training", self.training.steps - self.step) as progress:
+            started, before, smooth = time.monotonic(), self.step, math.nan
+            for points, photographs in _batches(examples, slots, self.training, self.step):
+                loss = self._advance(points.to(self.device), photographs.to(self.device))
+                smooth = loss if math.isnan(smooth) else 0.98 * smooth + 0.02 * loss
+                speed = (self.step - before) * self.training.batch / (time.monotonic() - started)
+                progress.advance(1, f"loss {smooth:.4f}, {speed:.1f} images/s")
+                if self.step % CHECKPOINT_EVERY == 0:
+                    self._save()
+        self._save()
+        return self._averaged()
+
+    def _advance(self, points: Points, photographs: Tensor) -> float:
+        """One step of AdamW."""
+        warm, done = self.training.warmup, self.step
+        progress = (done - warm) / max(1, self.training.steps - warm)
+        factor = (done + 1) / warm if done < warm else 0.5 * (1 + math.cos(math.pi * progress))
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.training.rate * factor
+        self.module.train()
+        with torch.autocast(self.device.type, self.dtype, enabled=self.dtype != torch.float32):
+            painted = self.module(points)
+        loss = reconstruction_loss(painted, photographs)
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.module.parameters(), 1.0)
+        self.optimizer.step()
+        self.step += 1
+        keep = min(self.training.average, self.step / (self.step + 9))  # short memory while weights still run away
+        for name, weight in self.module.state_dict().items():
+            if weight.is_floating_point():
+                self.average[name].lerp_(weight, 1 - keep)
+        value = float(loss.detach())
+        if not math.isfinite(value):
+            raise FloatingPointError(f"the loss is {value} at step {self.step}")
+        return value
+
+    def _averaged(self) -> Inverter:
+        self.module.load_state_dict(self.average)
+        return self.module.eval()
+
+    def _save(self) -> None:
+        arrays = {f"weights/{name}": value.cpu().numpy() for name, value in self.module.state_dict().items()}
+        arrays |= {f"average/{name}": value.cpu().numpy() for name, value in self.average.items()}
+        for index, state in self.optimizer.state_dict()["state"].items():
+            arrays |= {f"adamw/{index}/{name}": value.cpu().numpy() for name, value in state.items()}
+        tensorfile.save(self.path, CHECKPOINT, arrays, {**self.meta, "step": self.step})
+
+    def _restore(self) -> None:
+        arrays, meta, _ = tensorfile.load(self.path, CHECKPOINT)
+        self.step = meta.pop("step")
+        _same_training(self.path, meta, self.meta)
+        tensors = {name: torch.from_numpy(array.copy()) for name, array in arrays.items()}
+        self.module.load_state_dict({name[8:]: value for name, value in tensors.items() if name.startswith("weights/")})
+        self.average = {name[8:]: value.to(self.device) for name, value in tensors.items() if name.startswith("average/")}
+        state = self.optimizer.state_dict()
+        state["state"] = {
+            index: {key: tensors[f"adamw/{index}/{key}"] for key in ("step", "exp_avg", "exp_avg_sq")}
+            for index in range(len(list(self.module.parameters())))
+        }
+        self.optimizer.load_state_dict(state)
+
+
+def _batches(examples: Examples, slots: int, training: Training, start: int) -> Iterator[tuple[Points, Tensor]]:
+    """Batches from step `start` on, the next being made while one is used."""
+
+    def make(step: int) -> tuple[Points, Tensor]:
+        rng = np.random.default_rng([training.seed, step])
+        return to_batch([examples.draw(rng) for _ in range(training.batch)], slots)
+
+    with ThreadPoolExecutor(1) as ahead:
+        upcoming = ahead.submit(make, start)
+        for step in range(start, training.steps):
+            ready = upcoming.result()
+            if step + 1 < training.steps:
+                upcoming = ahead.submit(make, step + 1)
+            yield ready
+
+
+def to_batch(examples: Sequence[Example], slots: int) -> tuple[Points, Tensor]:
+    """-> the encoded releases, (B, 3, 256, 256) photographs in [0, 1]"""
+    points = encode([example.release for example in examples], [example.condition for example in examples], slots)
+    pixels = torch.from_numpy(np.stack([example.pixels for example in examples]))
+    return points, pixels.permute(0, 3, 1, 2).float() / 255
+
+
+def validate(module: Inverter, examples: Examples, views: Sequence[PhotographView], slots: int) -> dict[str, float]:
+    """Mean MAE, SSIM (where its window fits) and PSNR over whole views, under settings drawn with a fixed seed."""
+    device, rng = pick_device(), np.random.default_rng(0)
+    scores = []
+    for view in views:
+        points, truth = to_batch([examples.whole(view, rng)], slots)
+        painted = paint(module, points.to(device)).cpu()
+        mse = float((painted - truth).square().mean())
+        scores.append((float((painted - truth).abs().mean()), float(ssim(painted[0], truth[0])), -10 * math.log10(mse)))
+    mae, similarity, psnr = np.mean(scores, axis=0)
+    return {"photographs": len(views), "mae": float(mae), "ssim": float(similarity), "psnr": float(psnr)}

@@ -1,0 +1,137 @@
+"""Networks on disk: half-precision safetensors whose metadata say what releases they were trained for."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from attacks.inversion.network import Inverter, Shape
+from bench import spec, tensorfile
+from bench.device import pick_device
+from bench.errors import UserError
+from bench.plugin import Between, Defense, Extractor, OneOf
+from bench.public import Public
+
+KIND = "inversion-network"
+
+
+@dataclass(frozen=True, eq=False)
+class Network:
+    """A trained network, ready to paint."""
+
+    module: Inverter
+    meta: dict[str, Any]
+    digest: str
+
+    @property
+    def served(self) -> dict[str, Between | OneOf]:
+        return {field: _setting(text) for field, text in self.meta["serves"].items()}
+
+
+def save(path: Path, module: Inverter, shape: Shape, meta: dict[str, Any]) -> str:
+    """Write the weights in half precision and return the file's digest."""
+    arrays = {
+        name: value.detach().cpu().numpy().astype(np.float16)
+        for name, value in module.state_dict().items()
+        if value.is_floating_point()
+    }
+    return tensorfile.save(path, KIND, arrays, {**meta, "shape": asdict(shape)})
+
+
+def load(path: Path) -> Network:
+    """Read a network and verify it; once for a file that does not change.
+
+    Raises
+    ------
+    UserError
+        if the file is damaged, or its tensors are not those of the network that it describes.
+    """
+    status = path.stat() if path.is_file() else None
+    return _load(path, status and (status.st_mtime_ns, status.st_size))
+
+
+@functools.lru_cache(maxsize=8)
+def _load(path: Path, version: object) -> Network:
+    arrays, meta, digest = tensorfile.load(path, KIND)
+    wrong = sorted({str(array.dtype) for array in arrays.values()} - {"float16", "float32"})
+    if wrong:
+        raise UserError(f"{path}: weights are {', '.join(wrong)}, expected float16 or float32")
+    shape = Shape(**{**meta["shape"], "widths": tuple(meta["shape"]["widths"])})
+    module = Inverter(shape)
+    for name, value in module.state_dict().items():
+        if not value.is_floating_point():
+            continue  # batch norm's counter of batches, which only training uses
+        if name not in arrays or arrays[name].shape != tuple(value.shape):
+            found = arrays[name].shape if name in arrays else "nothing"
+            raise UserError(f"{path}: tensor {name} has shape {found}, expected {tuple(value.shape)}")
+        value.copy_(torch.from_numpy(arrays[name].astype(np.float32)))
+    module.eval().to(pick_device(), memory_format=torch.channels_last)  # type: ignore[call-overload]
+    return Network(module, meta, digest)
+
+
+@torch.no_grad()
+def start_from(fresh: Inverter, trained: Inverter, candidates: int) -> None:
+    """Start a network from one that paints raw descriptors.
+
+    Its first layer reads the first `candidates` slots as descriptors (a set's words; of a subspace the point nearest to zero),
+    with weights shared out so that the sum of independent ones keeps its size, and nothing of the other slots and the
+    condition. Everything else is taken over as it is.
+
+    Raises
+    ------
+    UserError
+        if the two networks have other sizes.
+    """
+    first = "embed.0.weight"
+    old, new = trained.state_dict(), fresh.state_dict()
+    if any(old[name].shape != value.shape for name, value in new.items() if name != first):
+        raise UserError("--start: that network has other sizes")
+    places = old[first].shape[1] - 2  # columns of the descriptor; two more say where in its cell the keypoint lies
+    slots = (new[first].shape[1] - 2) // places
+    for name, value in new.items():
+        if name != first:
+            value.copy_(old[name])
+    new[first].zero_()
+    new[first][:, : candidates * places] = (old[first][:, :places] / candidates**0.5).repeat(1, candidates)
+    new[first][:, slots * places : slots * places + 2] = old[first][:, places:]
+
+
+def describe(defense: Defense, served: dict[str, Between | OneOf], extractor: Extractor, public: Public) -> dict[str, Any]:
+    """What a network is trained for, as its metadata say it."""
+    return {
+        "defense": {field: value for field, value in spec.configuration(defense, public).items() if field not in served},
+        "serves": {field: _text(setting) for field, setting in served.items()},
+        "extractor": spec.configuration(extractor, public),
+    }
+
+
+def misfit(meta: dict[str, Any], defense: Defense, extractor: Extractor, public: Public) -> str | None:
+    """Why a network was not trained for the releases of `defense`; None if it was."""
+    if meta["defense"]["name"] != defense.name():
+        return f"trained for {meta['defense']['name']}"
+    have = spec.configuration(defense, public)
+    for field, text in meta["serves"].items():
+        if getattr(defense, field) not in _setting(text):
+            return f"trained for {field} {_setting(text)}, not {getattr(defense, field)}"
+    for field, value in meta["defense"].items():
+        if have.get(field) != value:
+            return f"trained for {field} {value}, not {have.get(field)}"
+    features = spec.configuration(extractor, public)
+    for field in sorted(meta["extractor"].keys() | features.keys()):
+        if meta["extractor"].get(field) != features.get(field):
+            wanted, got = meta["extractor"].get(field), features.get(field)
+            return f"trained for features with {field} {wanted}, not {got}"
+    return None
+
+
+def _text(setting: Between | OneOf) -> dict[str, list[Any]]:
+    return {"between": [setting.low, setting.high]} if isinstance(setting, Between) else {"one_of": list(setting.values)}
+
+
+def _setting(text: dict[str, list[Any]]) -> Between | OneOf:
+    return Between(*text["between"]) if "between" in text else OneOf(tuple(text["one_of"]))

@@ -1,0 +1,36 @@
+"""Nearest (Dusmanu et al., CVPR 2021; the paper's Table 1).
+
+Each subspace is replaced by its nearest neighbour in a public database. That is the attacker's own Z: in the defense's W the
+nearest would be an adversarial descriptor.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bench.kernels.search import unit_rows
+from bench.kernels.subspaces import nearest_to_subspaces
+from bench.plugin import Asset, DescriptorAttack, View
+from bench.types import Floats, Knowledge, Subspaces
+
+
+@dataclass(frozen=True, kw_only=True)
+class Nearest(DescriptorAttack):
+    """Takes the public word nearest to each subspace for the descriptor."""
+
+    accepts = (Subspaces,)
+    needs = frozenset({Knowledge.PUBLIC_DATABASE})
+
+    database: Asset = Asset("shipped-public")
+
+    def recover(self, view: View, rng: np.random.Generator) -> Floats:
+        release = view.release
+        if not isinstance(release, Subspaces):
+            raise TypeError(f"nearest attacks Subspaces, got {type(release).__name__}")
+        words = unit_rows(view.know(Knowledge.PUBLIC_DATABASE).words)  # (K, D)
+        return words[nearest_to_subspaces(release, words)[0]]
+
+
+PLUGIN = Nearest

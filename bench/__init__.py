@@ -1,0 +1,35 @@
+"""The privacy benchmark for local image features: what an attacker still sees, what a server can still do.
+
+import bench
+from defenses.ldp import LDP
+from attacks.dia import DIA
+
+records = bench.run(defenses=[LDP(epsilon=10)], attacks=[DIA()], images="photos")
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from bench.protection import protect
+    from bench.records import load_records
+    from bench.runner import run
+
+    __version__: str
+
+__all__ = ["__version__", "load_records", "protect", "run"]
+
+# Imported when first used, so that `import bench` and `bench --help` cost nothing.
+_HOMES = {"protect": "bench.protection", "load_records": "bench.records", "run": "bench.runner"}
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("feature-privacy-bench")
+    if name not in _HOMES:
+        raise AttributeError(f"module 'bench' has no attribute {name!r}")
+    return getattr(importlib.import_module(_HOMES[name]), name)

@@ -1,0 +1,302 @@
+"""The command line. Heavy libraries are imported by the command that needs them, so that `bench --help` is quick."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import sys
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, NoReturn
+
+from bench.errors import UserError, unknown
+
+if TYPE_CHECKING:
+    from bench.plugin import Task
+    from bench.records import Record
+    from bench.runner import Plan
+
+DONE, FAILED, MISTAKE, INTERRUPTED = 0, 1, 2, 130
+BROKEN_PIPE = 141  # as a shell reports a program that SIGPIPE ended
+GO_ON = "what was written is kept; run the same command again to go on"
+PIPED_WIDTH = 400  # columns of a table that goes to a file: its cells are not folded, so that they can be searched
+
+COMMANDS = ("run", "list", "dictionary", "train")
+
+EXAMPLES = """examples:
+  bench run --defense ldp --attack dia
+  bench run --defense ldp:epsilon=12,subset_size=4 --defense affine:dim=4 --attack nearest --attack dia --images DIR --out runs/x
+  bench list
+  bench dictionary build --images DIR --size 256000 --out K.safetensors
+  bench train --defense ldp --images DIR --out W.safetensors
+
+exit status: 0 done, 1 some photograph failed (all else is done and written), 2 a mistake in what was asked (nothing is written)
+"""
+RUN_EXAMPLES = """A plugin is written name:field=value,field=value; `bench list` shows names and fields.
+Repeated options make a grid.
+
+examples:
+  bench run --defense ldp --attack dia
+  bench run --defense none --defense ldp:epsilon=inf --attack dia --extractor sift:upright=false --images DIR --json
+"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit status."""
+    try:
+        status = _command(list(sys.argv[1:] if argv is None else argv))
+        sys.stdout.flush()
+    except UserError as error:
+        return _say(MISTAKE, " ".join(str(error).split()))
+    except KeyboardInterrupt:
+        return _say(INTERRUPTED, f"interrupted; {GO_ON}")
+    except MemoryError:
+        return _say(FAILED, f"out of memory; {GO_ON}, perhaps with fewer defenses at once")
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # so that Python's last flush does not fail again
+        return BROKEN_PIPE
+    except OSError as error:
+        return _say(FAILED, f"{error.filename or 'writing'}: {error.strerror or error}; {GO_ON}")
+    return status
+
+
+class _Parser(argparse.ArgumentParser):
+    """Reports mistakes as `UserError`s."""
+
+    def error(self, message: str) -> NoReturn:
+        raise UserError(message)
+
+
+def _command(argv: list[str]) -> int:
+    _check_commands(argv)
+    args, extra = _parser().parse_known_args(argv)
+    if "command" not in args:
+        raise UserError("say what to do: run, list, dictionary build or train (bench --help explains)")
+    if extra:
+        option = extra[0].partition("=")[0]
+        if option.startswith("-"):
+            raise unknown("option", option, set(re.findall(r"--[a-z][a-z-]*", args.options)))
+        raise UserError(f"{extra[0]!r} is one argument too many")
+    for option in args.required:
+        if not getattr(args, option):
+            raise UserError(f"--{option} is missing (bench {' '.join(argv[:1])} --help explains)")
+    return int(args.command(args))
+
+
+def _check_commands(argv: list[str]) -> None:
+    """Refuse misspelt commands, before argparse does so without a hint."""
+    if argv and not argv[0].startswith("-") and argv[0] not in COMMANDS:
+        raise unknown("command", argv[0], COMMANDS)
+    if argv[:1] == ["dictionary"] and len(argv) > 1 and not argv[1].startswith("-") and argv[1] != "build":
+        raise unknown("command", " ".join(argv[:2]), ["dictionary build"])
+
+
+def _parser() -> argparse.ArgumentParser:
+    text = argparse.RawDescriptionHelpFormatter
+    parser = _Parser(
+        prog="bench",
+        description="The privacy benchmark for local image features: what an attacker still sees of a photograph.",
+        epilog=EXAMPLES,
+        formatter_class=text,
+        allow_abbrev=False,
+    )
+    parser.add_argument("--version", action="version", version=f"feature-privacy-bench {version('feature-privacy-bench')}")
+    commands = parser.add_subparsers(metavar="COMMAND", parser_class=_Parser)
+
+    def add(to: argparse._SubParsersAction, name: str, summary: str, epilog: str = "") -> argparse.ArgumentParser:
+        added = to.add_parser(name, help=summary, description=summary, epilog=epilog, formatter_class=text, allow_abbrev=False)
+        assert isinstance(added, argparse.ArgumentParser)
+        return added
+
+    run = add(commands, "run", "run defenses against attacks on photographs, and report what was recovered", RUN_EXAMPLES)
+    run.add_argument("--defense", action="append", metavar="SPEC", help="what protects the features; may be repeated")
+    run.add_argument("--attack", action="append", metavar="SPEC", help="who tries to undo it; may be repeated")
+    run.add_argument(
+        "--task", metavar="SPEC", default="reconstruction", help="what a release is judged by (default: %(default)s)"
+    )
+    run.add_argument("--extractor", metavar="SPEC", default="sift", help="what makes the features (default: %(default)s)")
+    run.add_argument("--images", type=Path, metavar="DIR", help="a folder of photographs (default: seven built-in ones)")
+    run.add_argument("--seed", type=_whole, default=0, metavar="N", help="of everything random (default: %(default)s)")
+    run.add_argument("--out", type=Path, metavar="DIR", help="folder for the results; resumed if it exists (default: in runs/)")
+    run.add_argument("--json", action="store_true", help="print the records instead of the table")
+    run.set_defaults(command=_run, required=("defense",), options=run.format_help())
+
+    show = add(commands, "list", "list plugins with their fields, and which attack applies to which defense")
+    show.add_argument("what", nargs="?", metavar="defenses|attacks|metrics|tasks|extractors")
+    show.set_defaults(command=_list, required=(), options=show.format_help())
+
+    dictionary = add(commands, "dictionary", "make dictionaries of descriptors")
+    dictionary.set_defaults(required=(), options=dictionary.format_help(), command=_no_dictionary_command)
+    build = add(
+        dictionary.add_subparsers(metavar="COMMAND", parser_class=_Parser), "build", "cluster the descriptors of a folder"
+    )
+    build.add_argument("--images", type=Path, metavar="DIR", help="a folder of photographs")
+    build.add_argument("--size", type=_whole, metavar="K", help="the number of words")
+    build.add_argument("--out", type=Path, metavar="FILE", help="the dictionary, a safetensors file")
+    build.add_argument("--seed", type=_whole, default=0, metavar="N", help="of the clustering (default: %(default)s)")
+    build.add_argument("--extractor", metavar="SPEC", default="sift", help="what makes the features (default: %(default)s)")
+    build.set_defaults(command=_build_dictionary, required=("images", "size", "out"), options=build.format_help())
+
+    train = add(commands, "train", "train, or resume, the attacker's inversion network for a defense's releases")
+    train.add_argument("--defense", metavar="SPEC", help="fields given are fixed; of the others the network serves all settings")
+    train.add_argument("--images", type=Path, metavar="DIR", help="a folder of photographs")
+    train.add_argument("--out", type=Path, metavar="FILE", help="the network's weights, a safetensors file")
+    train.add_argument(
+        "--validation",
+        type=Path,
+        metavar="DIR|LIST",
+        help="a folder, or a file of names in --images to hold out (default: every 20th)",
+    )
+    train.add_argument(
+        "--crossfit",
+        action="append",
+        default=[],
+        metavar="FILE",
+        help="a dictionary that quantises photographs which the defense's own was made from; may be repeated",
+    )
+    train.add_argument("--start", type=Path, metavar="FILE", help="weights of a network for raw descriptors to start from")
+    train.add_argument("--rate", type=float, metavar="R", help="the learning rate at its peak")
+    train.add_argument("--steps", type=_whole, metavar="N", help="steps of training")
+    train.add_argument("--batch", type=_whole, metavar="N", help="photographs a step")
+    train.add_argument("--seed", type=_whole, default=0, metavar="N", help="of the training (default: %(default)s)")
+    train.add_argument("--extractor", metavar="SPEC", default="sift", help="what makes the features (default: %(default)s)")
+    train.set_defaults(command=_train, required=("defense", "images", "out"), options=train.format_help())
+    return parser
+
+
+def _run(args: argparse.Namespace) -> int:
+    from bench import registry, runner, spec
+    from bench.progress import Progress
+    from leaderboard import report
+
+    task = spec.read(args.task, registry.TASK)
+    _check_attacks(task, args.attack)
+    plan = runner.prepare(
+        [spec.read(text, registry.DEFENSE) for text in args.defense],
+        [spec.read(text, registry.ATTACK) for text in args.attack or []],
+        args.images,
+        extractor=spec.read(args.extractor, registry.EXTRACTOR),
+        task=task,
+        seed=args.seed,
+    )
+    out = args.out or Path("runs") / _run_name(plan)
+    records: list[Record] = []
+    noted: set[str] = set()
+    with Progress(f"{len(plan.sources)} photographs, {len(plan.cells)} pairs", len(plan)) as progress:
+        for record in runner.execute(plan, out):
+            records.append(record)
+            progress.advance(note=record["unit"])
+            for note in record["notes"]:
+                if note not in noted:
+                    progress.say(f"bench: {note}")
+            noted.update(record["notes"])
+            if record["status"] == "failed":
+                progress.say(f"bench: failed: {record['unit']}, {record['defense']['name']}: {record['reason']}")
+    report.write(records, plan.sources, out)
+    _print_records(records) if args.json else _print_tables(records)
+    _say(DONE, f"written to {out}")
+    return FAILED if any(record["status"] == "failed" for record in records) else DONE
+
+
+def _list(args: argparse.Namespace) -> int:
+    from bench.listing import SECTIONS, listing
+
+    if args.what is not None and args.what not in SECTIONS:
+        raise unknown("list", args.what, SECTIONS)
+    _print_rich(*listing(args.what))
+    return DONE
+
+
+def _no_dictionary_command(args: argparse.Namespace) -> int:
+    raise UserError("say what to do with a dictionary: bench dictionary build")
+
+
+def _build_dictionary(args: argparse.Namespace) -> int:
+    from bench import registry, spec
+    from bench.features.build import build
+
+    built = build(args.images, args.size, args.out, spec.read(args.extractor, registry.EXTRACTOR), args.seed)
+    print(f"{args.out}: {len(built)} words from {built.meta['descriptors']} descriptors of {len(built.photographs)} photographs,")
+    print(f"mean cosine {built.meta['mean_cosine']:.4f}, {built.digest}")
+    return DONE
+
+
+def _train(args: argparse.Namespace) -> int:
+    from attacks.inversion.train import Training, train
+    from bench import registry, spec
+    from bench.datasets.photographs import folder, held_out
+    from bench.plugin import Asset
+
+    plugin, given = spec.parse(args.defense, registry.DEFENSE)
+    photographs, validation = held_out(folder(args.images), args.validation)
+    chosen = {name: value for name in ("steps", "batch", "rate", "seed") if (value := getattr(args, name)) is not None}
+    meta = train(
+        spec.build(plugin, given),
+        {name: settings for name, settings in plugin.serves.items() if name not in given},
+        photographs=photographs,
+        validation=validation,
+        out=args.out,
+        extractor=spec.read(args.extractor, registry.EXTRACTOR),
+        crossfit=[Asset(file) for file in args.crossfit],
+        start=args.start,
+        training=Training(**chosen),
+    )
+    scores = ", ".join(f"{name} {value:.4g}" for name, value in meta["validation"].items())
+    print(f"{args.out}: {meta['crops']} crops of {meta['photographs']} photographs; validation: {scores}")
+    return DONE
+
+
+def _check_attacks(task: Task, attacks: list[str] | None) -> None:
+    if task.attacked and not attacks:
+        raise UserError(f"--attack is missing: the task {task.name()} judges what an attack recovers (bench list attacks)")
+    if attacks and not task.attacked:
+        raise UserError(f"--attack: the task {task.name()} judges the release itself and takes none")
+
+
+def _run_name(plan: Plan) -> str:
+    """The defenses' and attacks' names, and eight digits that tell configurations apart."""
+    defenses = dict.fromkeys(cell.defense.name() for cell in plan.cells)
+    attacks = dict.fromkeys(cell.attack.name() if cell.attack else plan.task.name() for cell in plan.cells)
+    return f"{'+'.join(defenses)[:60]}-{'+'.join(attacks)[:60]}-{plan.hash[:8]}"
+
+
+def _print_records(records: list[Record]) -> None:
+    for record in records:
+        print(json.dumps(record, allow_nan=False))
+
+
+def _print_tables(records: list[Record]) -> None:
+    from leaderboard import tables
+
+    _print_rich(*(tables.to_rich(table, foldable=sys.stdout.isatty()) for table in tables.tables(records)))
+
+
+def _print_rich(*items: object) -> None:
+    from rich.console import Console
+
+    console = Console(width=None if sys.stdout.isatty() else PIPED_WIDTH)
+    # Rich itself would answer a closed pipe with exit status 1, which is taken.
+    with console.capture() as captured:
+        for item in items:
+            console.print(item)
+    encoding = sys.stdout.encoding or "utf-8"
+    sys.stdout.write(captured.get().encode(encoding, "backslashreplace").decode(encoding))
+
+
+def _whole(text: str) -> int:
+    try:
+        return int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected a whole number, not {text!r}") from None
+
+
+def _say(status: int, line: str) -> int:
+    print(f"bench: {line}", file=sys.stderr, flush=True)
+    return status
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,45 @@
+"""Progress on stderr: a bar on a terminal, a line now and then elsewhere."""
+
+from __future__ import annotations
+
+import sys
+import time
+from types import TracebackType
+from typing import Self
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+from rich.progress import Progress as Bar
+
+EVERY = 20.0  # seconds between lines where stderr is no terminal
+
+
+class Progress:
+    """Counts units of work that take a while; `say` prints a line beside the bar."""
+
+    def __init__(self, title: str, total: int) -> None:
+        self._title, self._total, self._done = title, total, 0
+        self._console = Console(stderr=True)
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+        self._bar = Bar(*columns, console=self._console, disable=not self._console.is_terminal)
+        self._task = self._bar.add_task(title, total=total)
+        self._started = self._last = time.monotonic()
+
+    def __enter__(self) -> Self:
+        self._bar.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._bar.stop()
+
+    def advance(self, units: int = 1, note: str = "") -> None:
+        self._done += units
+        self._bar.update(self._task, advance=units, description=f"{self._title} {note}".rstrip())
+        now = time.monotonic()
+        if not self._console.is_terminal and (now - self._last > EVERY):
+            self._last = now
+            left = (now - self._started) / self._done * (self._total - self._done) if self._done else 0.0
+            print(f"{self._title}: {self._done}/{self._total} {note} {left:.0f} s left", file=sys.stderr, flush=True)
+
+    def say(self, line: str) -> None:
+        self._console.print(line, markup=False, highlight=False, soft_wrap=True)

@@ -1,0 +1,377 @@
+"""Runs defenses against attacks on photographs: plans the cells, resumes, survives failures, and yields records.
+
+The randomness of a release is a function of (seed, photograph's content, defense, extractor) alone, never of the attack, the
+order, or what was done before. So every attack sees the same release, and a resumed run gives what an uninterrupted one gives.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import itertools
+import logging
+import time
+import traceback
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from bench import environment, records, registry, spec
+from bench.datasets import photographs
+from bench.datasets.photographs import Photograph, Source
+from bench.errors import PluginError, UnitError, UserError, blamed
+from bench.features.sift import Sift
+from bench.plugin import Attack, Defense, Extractor, Metric, Outcome, Privacy, Task, Trial
+from bench.public import Public
+from bench.records import EVERY_UNIT, Record
+from bench.tasks.reconstruction import Reconstruction
+from bench.types import Features, Floats, Release
+
+ERRORS = "errors.log"
+Images = Path | str | Sequence[Path | str] | None
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """One defense against one attack."""
+
+    defense: Defense
+    attack: Attack | None
+    privacy: Privacy
+    head: Record  # what all its records begin with
+    reason: str | None  # why it does not apply, if it does not
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """Everything that a run will do, checked as far as it can be without doing it."""
+
+    task: Task
+    cells: tuple[Cell, ...]
+    sources: tuple[Source, ...]
+    hashes: dict[str, str]  # photograph's name -> its content's hash
+    extractor: Extractor
+    metrics: tuple[Metric, ...]
+    public: Public
+    seed: int
+
+    @property
+    def hash(self) -> str:
+        """Of configuration and inputs."""
+        return records.short_hash(sorted(cell.head["cell_id"] for cell in self.cells))
+
+    def __len__(self) -> int:
+        """The number of its records."""
+        return sum(1 if cell.reason else len(self.sources) for cell in self.cells)
+
+
+def run(
+    defenses: Sequence[Defense],
+    attacks: Sequence[Attack] = (),
+    images: Images = None,
+    *,
+    extractor: Extractor | None = None,
+    task: Task | None = None,
+    seed: int = 0,
+    out: Path | str | None = None,
+) -> list[Record]:
+    """Run every defense against every attack, and return one record for each photograph of each pair.
+
+    Parameters
+    ----------
+    defenses, attacks : plugins, such as `[LDP(epsilon=10)]` and `[DIA()]`
+    images : a folder, files, or None for the built-in photographs
+    extractor : `Sift()` if None
+    task : `Reconstruction()` if None
+    seed : of everything random. A release whose seed is known is for measuring and protects nobody.
+    out : a folder to keep records and reconstructions in; what it holds already is not done again
+
+    Raises
+    ------
+    UserError
+        if something is wrong with what was asked; nothing has been written then.
+    """
+    plan = prepare(defenses, attacks, images, extractor=extractor, task=task, seed=seed)
+    return list(execute(plan, None if out is None else Path(out)))
+
+
+def prepare(
+    defenses: Sequence[Defense],
+    attacks: Sequence[Attack] = (),
+    images: Images = None,
+    *,
+    extractor: Extractor | None = None,
+    task: Task | None = None,
+    seed: int = 0,
+) -> Plan:
+    """Check what was asked, and lay out what is to be done. Parameters as those of `run`.
+
+    Raises
+    ------
+    UserError
+        if something is wrong with it, or no pair of it applies.
+    """
+    task = task or Reconstruction()
+    extractor = extractor or Sift()
+    if not defenses:
+        raise UserError("no defense was given")
+    if task.attacked and not attacks:
+        raise UserError(f"{task.name()} needs an attack")
+    if not task.attacked and attacks:
+        raise UserError(f"{task.name()} judges the release itself and takes no attack")
+    name, sources = _dataset(images)
+    hashes = {source.name: _content_hash(source) for source in sources}
+    public = Public()
+    dataset = {
+        "name": name,
+        "hash": "sha256:" + hashlib.sha256(records.canonical(hashes).encode()).hexdigest(),
+        "extractor": spec.configuration(extractor, public),
+    }
+    metrics = tuple(metric() for metric in registry.everything(registry.METRIC))
+    settings = {metric.name(): _settings(metric) for metric in metrics}
+    ran = environment.describe([task, extractor, *defenses, *attacks, *metrics])
+    tried: Sequence[Attack | None] = attacks or [None]
+    cells = []
+    for defense in defenses:
+        promise = defense.privacy(public)
+        for attack in tried:
+            reason = task.inapplicable(defense, attack, extractor, public)
+            head = {
+                "schema": records.SCHEMA,
+                "task": task.name(),
+                "defense": spec.configuration(defense, public),
+                "attack": _attack_configuration(task, defense, attack, extractor, public, reason),
+                "dataset": dataset,
+                "metric_settings": settings,
+                "seed": seed,
+            }
+            cell_id = records.cell_id(spec.written(task), head["defense"], head["attack"], dataset, seed, settings)
+            head |= {"cell_id": cell_id, "run_hash": records.run_hash(cell_id, ran), "environment": ran}
+            cells.append(Cell(defense, attack, promise, head, reason))
+    if all(cell.reason for cell in cells):
+        raise UserError("nothing to run: " + "; ".join(sorted({str(cell.reason) for cell in cells})))
+    unique = {cell.head["cell_id"]: cell for cell in cells}  # one that was asked for twice is done once
+    plan = Plan(task, tuple(unique.values()), tuple(sources), hashes, extractor, metrics, public, seed)
+    _rehearse(plan)
+    return plan
+
+
+def execute(plan: Plan, out: Path | None = None) -> Iterator[Record]:
+    """Do what was planned and yield its records, those that `out` holds already included.
+
+    Raises
+    ------
+    UserError
+        before anything is written, if `out` cannot be written or holds a damaged record.
+    OSError
+        if the disk is full; every record yielded so far is kept.
+    """
+    if out is None:
+        yield from (record for record, _ in _executed(plan, {}, None))
+        return
+    file = out / records.FILE
+    before = records.read(file) if file.is_file() else records.Contents([], 0)
+    if before.notice:
+        logging.getLogger(__name__).warning(before.notice)
+    done = {(record["run_hash"], record["unit"]): record for record in before.records if record["status"] != "failed"}
+    with records.Log(file) as log:
+        for record, fresh in _executed(plan, done, out):
+            if fresh:
+                log.append(record)
+            yield record
+
+
+def picture(out: Path, record: Record) -> Path:
+    """Where the reconstruction of a record is kept."""
+    return out / "reconstructions" / record["cell_id"] / f"{record['unit']}.png"
+
+
+def randomness(*parts: Any) -> np.random.Generator:
+    """A generator that is a function of `parts` alone, which are JSON."""
+    return np.random.default_rng(int(hashlib.sha256(records.canonical(parts).encode()).hexdigest(), 16))
+
+
+def _dataset(images: Images) -> tuple[str, list[Source]]:
+    if images is None:
+        return "builtin", photographs.builtin()
+    if isinstance(images, (str, Path)):
+        return Path(images).resolve().name, photographs.folder(Path(images))
+    sources = [Source(Path(path).name, Path(path)) for path in images]
+    if len({source.name for source in sources}) < len(sources):
+        raise UserError("two of the photographs have the same file name")
+    if not sources:
+        raise UserError("no photograph was given")
+    return "files", sources
+
+
+def _content_hash(source: Source) -> str:
+    try:
+        return source.content_hash()
+    except OSError as error:
+        return f"unreadable: {error.strerror}"  # its record will be `failed`
+
+
+def _settings(metric: Metric) -> dict[str, Any]:
+    fields = spec.written(metric)
+    del fields["name"]
+    return fields | dict(metric.parameters)
+
+
+def _attack_configuration(
+    task: Task, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public, reason: str | None
+) -> dict[str, Any] | None:
+    if attack is None:
+        return None
+    if reason is not None:
+        return spec.written(attack)
+    return spec.configuration(attack, public, task.resolved(defense, attack, extractor, public))
+
+
+def _rehearse(plan: Plan) -> None:
+    """Protect one keypoint of the first good photograph, so that a user's mistake shows before anything is written."""
+    for source in plan.sources:
+        try:
+            features = _observe(plan, source)[1]
+        except UnitError:
+            continue
+        one = replace(
+            features,
+            keypoints=features.keypoints[:1],
+            descriptors=features.descriptors[:1],
+            codes=None if features.codes is None else features.codes[:1],
+        )
+        for cell in plan.cells:
+            with contextlib.suppress(UnitError):  # a broken plugin makes failed records, later
+                _protect(plan, cell, one, "rehearsal")
+        return
+
+
+def _executed(plan: Plan, done: Mapping[tuple[str, str], Record], out: Path | None) -> Iterator[tuple[Record, bool]]:
+    """All records in order, and whether each was made just now. What holds for every unit comes with the first."""
+    cells = plan.cells
+    for source in plan.sources:
+        units = [source.name if cell.reason is None else EVERY_UNIT for cell in cells]
+        known = [done.get((cell.head["run_hash"], unit)) for cell, unit in zip(cells, units, strict=True)]
+        left = [cell for cell, earlier in zip(cells, known, strict=True) if earlier is None and cell.reason is None]
+        fresh = _unit(plan, source, left, out)
+        for cell, earlier in zip(cells, known, strict=True):
+            if earlier is not None:
+                yield earlier, False
+            elif cell.reason is not None:
+                yield _record(cell, EVERY_UNIT, status="n/a", reason=cell.reason), True
+            else:
+                yield next(fresh), True
+        cells = tuple(cell for cell in cells if cell.reason is None)
+
+
+def _unit(plan: Plan, source: Source, cells: Sequence[Cell], out: Path | None) -> Iterator[Record]:
+    """Read and extract one photograph, protect it once by each defense, and let every attack at it."""
+    try:
+        photograph, features = _observe(plan, source)
+    except (UnitError, UserError) as error:
+        yield from _failed(cells, source, error, out)
+        return
+    for _, group in itertools.groupby(cells, key=lambda cell: cell.head["defense"]):
+        members = list(group)
+        try:
+            release = _protect(plan, members[0], features, plan.hashes[source.name])
+        except (UnitError, UserError) as error:
+            yield from _failed(members, source, error, out)
+            continue
+        for cell in members:
+            try:
+                yield _judged(plan, cell, source, photograph, features, release, out)
+            except (UnitError, UserError) as error:
+                yield from _failed([cell], source, error, out)
+
+
+def _observe(plan: Plan, source: Source) -> tuple[Photograph, Features]:
+    with blamed("the reader of photographs"):
+        photograph = photographs.read(source.path)
+    with blamed(f"plugin {plan.extractor.name()}"):
+        features = plan.extractor.extract(photograph.pixels, source.path)
+    if len(features) == 0:
+        raise UnitError(f"{source.name}: no keypoint was found")
+    return photograph, features
+
+
+def _protect(plan: Plan, cell: Cell, features: Features, content: str) -> Release:
+    head = cell.head
+    rng = randomness("release", plan.seed, content, head["defense"], head["dataset"]["extractor"])
+    with blamed(f"plugin {cell.defense.name()}"):
+        release = cell.defense.protect(features, plan.public, rng)
+        if not isinstance(release, cell.defense.releases):
+            raise TypeError(f"protect returned {type(release).__name__}, expected {cell.defense.releases.__name__}")
+    return release
+
+
+def _judged(
+    plan: Plan, cell: Cell, source: Source, photograph: Photograph, features: Features, release: Release, out: Path | None
+) -> Record:
+    head = cell.head
+    content = plan.hashes[source.name]
+    trial = Trial(
+        pixels=photograph.pixels,
+        secret=features,
+        release=release,
+        defense=cell.defense,
+        attack=cell.attack,
+        extractor=plan.extractor,
+        public=plan.public,
+        metrics=plan.metrics,
+        rng=randomness("attack", plan.seed, content, head["defense"], head["dataset"]["extractor"], head["attack"]),
+    )
+    started = time.perf_counter()
+    with blamed(f"task {plan.task.name()}"):
+        outcome = plan.task.judge(trial)
+    record = _record(cell, source.name, status="ok", outcome=outcome, keypoints=len(features), notes=photograph.notes)
+    record["seconds"] = time.perf_counter() - started
+    if out is not None and outcome.image is not None:
+        _save_picture(picture(out, record), outcome.image)
+    return record
+
+
+def _failed(cells: Sequence[Cell], source: Source, error: Exception, out: Path | None) -> Iterator[Record]:
+    if isinstance(error, PluginError) and out is not None:
+        with (out / ERRORS).open("a", encoding="utf-8") as log:
+            log.write(f"{source.name}\n{''.join(traceback.format_exception(error))}\n")
+    for cell in cells:
+        yield _record(cell, source.name, status="failed", reason=str(error))
+
+
+def _record(
+    cell: Cell,
+    unit: str,
+    *,
+    status: str,
+    reason: str | None = None,
+    outcome: Outcome | None = None,
+    keypoints: int | None = None,
+    notes: Sequence[str] = (),
+) -> Record:
+    epsilon = cell.privacy.epsilon
+    return cell.head | {
+        "unit": unit,
+        "status": status,
+        "reason": reason,
+        "metrics": {} if outcome is None else {**outcome.metrics, "keypoints": keypoints},
+        "privacy": {
+            "guarantee": cell.privacy.guarantee,
+            "epsilon_descriptor": spec.finite(epsilon),
+            # The keypoints of one photograph compose.
+            "epsilon_image": None if epsilon is None or keypoints is None else spec.finite(keypoints * epsilon),
+            "log10_true": cell.privacy.log10_true,
+            "seeded": True,
+        },
+        "seconds": None,
+        "notes": [*notes, *(outcome.notes if outcome else ())],
+    }
+
+
+def _save_picture(path: Path, image: Floats) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(np.rint(image * 255.0).astype(np.uint8)).save(path)

@@ -1,0 +1,146 @@
+"""Reconstruction: how much of the photograph an attacker paints from a release, and how near he comes to its descriptors."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from bench import fields, registry, spec
+from bench.errors import UnitError, UserError, blamed
+from bench.plugin import Attack, Defense, DescriptorAttack, Extractor, ImageAttack, Metric, Outcome, Task, Trial, View
+from bench.public import Public
+from bench.types import Descriptors, Floats, Knowledge, Release
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reconstruction(Task):
+    """Compares the attacker's image with the photograph, and his descriptors with the true ones.
+
+    Where an attack recovers descriptors, the `inverter` paints them: the network for raw descriptors.
+    """
+
+    attacked = True
+
+    inverter: str = "dia"  # an attack that reconstructs images
+
+    def inapplicable(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> str | None:
+        if attack is None:
+            return "reconstruction needs an attack"
+        missing = attack.needs - offered(attack, defense, public).keys()
+        if missing:
+            wanted = " and ".join(sorted(need.value for need in missing))
+            return f"{attack.name()} needs {wanted}; there is none for {defense.name()}"
+        return attack.inapplicable(defense, extractor, public)
+
+    def resolved(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> Mapping[str, Any]:
+        if attack is None:
+            return {}
+        for load in granted(attack, defense, public).values():
+            load()
+        digests = dict(attack.assets(defense, extractor, public))
+        if not isinstance(attack, DescriptorAttack):
+            return digests
+        inverter, undefended, reason = self._inverter(extractor, public)
+        if reason is not None:
+            return digests | {"inversion": None}
+        return digests | {"inversion": spec.configuration(inverter, public, inverter.assets(undefended, extractor, public))}
+
+    def judge(self, trial: Trial) -> Outcome:
+        attack = trial.attack
+        if isinstance(attack, ImageAttack):
+            return compared(trial, None, reconstructed(attack, trial.defense, trial.release, trial))
+        if not isinstance(attack, DescriptorAttack):
+            raise UnitError("reconstruction needs an attack")
+        found = recovered(attack, trial)
+        inverter, undefended, reason = self._inverter(trial.extractor, trial.public)
+        if reason is not None:
+            return compared(trial, found, None, (f"no image: {reason}",))
+        release = Descriptors(keypoints=trial.release.keypoints, size=trial.release.size, descriptors=found)
+        return compared(trial, found, reconstructed(inverter, undefended, release, trial))
+
+    def _inverter(self, extractor: Extractor, public: Public) -> tuple[ImageAttack, Defense, str | None]:
+        """The attack that paints descriptors, the defense that it was made for, and why it cannot be used, if it cannot."""
+        inverter = spec.read(self.inverter, registry.ATTACK)
+        if not isinstance(inverter, ImageAttack):
+            raise UserError(f"reconstruction: inverter must reconstruct images, and {inverter.name()} does not")
+        undefended = registry.lookup(registry.DEFENSE, "none")()
+        return inverter, undefended, inverter.inapplicable(undefended, extractor, public)
+
+
+def offered(attack: Attack, defense: Defense, public: Public) -> dict[Knowledge, Callable[[], Any]]:
+    """What there is to know beside a release made by that defense."""
+    databases = fields.asset_fields(defense)
+    own = fields.asset_fields(attack).get("database", "shipped-public")
+    offers: dict[Knowledge, Callable[[], Any]] = {
+        Knowledge.PUBLIC_DATABASE: lambda: public.dictionary(own),
+        Knowledge.TRAINING_IMAGES: lambda: public,
+    }
+    if "database" in databases:
+        offers[Knowledge.DATABASE] = lambda: public.dictionary(databases["database"])
+    return offers
+
+
+def granted(attack: Attack, defense: Defense, public: Public) -> dict[Knowledge, Callable[[], Any]]:
+    """Of what there is to know, that which the attack declared to need."""
+    return {what: load for what, load in offered(attack, defense, public).items() if what in attack.needs}
+
+
+def view(attack: Attack, defense: Defense, release: Release, extractor: Extractor, public: Public) -> View:
+    """All that the attack gets. The release is a copy: whatever the attack does to it, the next attack sees what was released."""
+    return View(release=copy.deepcopy(release), defense=defense, extractor=extractor, knowledge=granted(attack, defense, public))
+
+
+def reconstructed(attack: ImageAttack, defense: Defense, release: Release, trial: Trial) -> Floats:
+    """The attacker's image. -> (H, W, 3)"""
+    with blamed(f"plugin {attack.name()}"):
+        image = attack.reconstruct(view(attack, defense, release, trial.extractor, trial.public), trial.rng)
+        width, height = release.size
+        _expect(image, (height, width, 3))
+        if image.min() < 0 or image.max() > 1:
+            raise ValueError(f"returned values from {image.min()} to {image.max()}, expected 0 to 1")
+    return image
+
+
+def recovered(attack: DescriptorAttack, trial: Trial) -> Floats:
+    """The attacker's descriptors. -> (N, D)"""
+    with blamed(f"plugin {attack.name()}"):
+        seen = view(attack, trial.defense, trial.release, trial.extractor, trial.public)
+        descriptors = attack.recover(seen, trial.rng)
+        _expect(descriptors, trial.secret.descriptors.shape)
+    return descriptors
+
+
+def compared(trial: Trial, descriptors: Floats | None, image: Floats | None, notes: tuple[str, ...] = ()) -> Outcome:
+    """Every metric of what was recovered; None for a metric of what was not."""
+    truth = (trial.pixels / 255.0).astype(np.float32)
+    values = {metric.name(): _measured(metric, trial.secret.descriptors, truth, descriptors, image) for metric in trial.metrics}
+    return Outcome(metrics=values, image=image, notes=notes)
+
+
+def _measured(
+    metric: Metric, true_descriptors: Floats, true_image: Floats, descriptors: Floats | None, image: Floats | None
+) -> float | None:
+    truth, estimate = (true_image, image) if metric.compares == "images" else (true_descriptors, descriptors)
+    if estimate is None:
+        return None
+    with blamed(f"plugin {metric.name()}"):
+        value = metric(truth, estimate)
+        if value is not None and not np.isfinite(value):
+            raise ValueError(f"returned {value}; a metric returns None where its value is not finite")
+        return None if value is None else float(value)
+
+
+def _expect(array: Any, shape: tuple[int, ...]) -> None:
+    if not isinstance(array, np.ndarray):
+        raise TypeError(f"returned {type(array).__name__}, expected a NumPy array")
+    if array.dtype != np.float32 or array.shape != shape:
+        raise ValueError(f"returned {array.dtype} {array.shape}, expected float32 {shape}")
+    if not np.isfinite(array).all():
+        raise ValueError("returned values that are not finite")
+
+
+PLUGIN = Reconstruction

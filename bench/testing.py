@@ -1,0 +1,181 @@
+"""The contract of plugins as checks that raise AssertionError. Run them on your own plugin:
+
+from bench.testing import check_defense, example_features, small_dictionary
+
+def test_mine(tmp_path):
+    check_defense(Mine(dictionary=small_dictionary(tmp_path)), Public(), example_features())
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bench.datasets.photographs import SIDE
+from bench.features import dictionary
+from bench.kernels.search import unit_rows
+from bench.plugin import Asset, Attack, Defense, DescriptorAttack, Extractor, ImageAttack, Metric
+from bench.public import Public
+from bench.tasks.reconstruction import Reconstruction, view
+from bench.types import Descriptors, Features, Floats, Indices, Release, Subspaces, WordSets
+
+TOLERANCE = 1e-5  # of norms and angles in float32
+
+
+def example_features(count: int = 50, seed: int = 0, length: int = 128) -> Features:
+    """Features as upright SIFT gives them, of no photograph."""
+    rng = np.random.default_rng(seed)
+    codes = np.minimum(rng.gamma(0.6, 40.0, (count, length)), 255).astype(np.uint8)
+    codes[:, 0] |= 1  # no row is zero
+    keypoints = rng.uniform(0, SIDE, (count, 2)).astype(np.float32)
+    return Features(keypoints=keypoints, descriptors=unit_rows(codes), codes=codes, size=(SIDE, SIDE))
+
+
+def small_dictionary(folder: Path, words: int = 512, seed: int = 1) -> Asset:
+    """Write a dictionary of made-up words and return it as a field's value."""
+    codes = example_features(words, seed).codes
+    assert codes is not None
+    path = folder / f"dictionary-{words}-{seed}.safetensors"
+    dictionary.save(path, codes, {"photographs": [], "extractor": {"name": "made-up"}})
+    return Asset(path)
+
+
+def check_defense(defense: Defense, public: Public, secret: Features) -> None:
+    """A defense releases what it says, of the keypoints as they are, with all randomness from `rng` and no tie to the secret."""
+    before = copy.deepcopy(secret)
+    release = defense.protect(secret, public, np.random.default_rng(1))
+    assert type(release) is defense.releases, f"released {type(release).__name__}, declares {defense.releases.__name__}"
+    assert same(secret, before), "changed the secret"
+    assert not _shared(release, secret), "the release shares memory with the secret"
+    assert np.array_equal(release.keypoints, secret.keypoints), "keypoints are released as they are"
+    assert release.size == secret.size
+    _check_release(release, len(secret))
+    assert same(release, defense.protect(secret, public, np.random.default_rng(1))), "the same rng gave another release"
+    if not isinstance(release, Descriptors):
+        assert not same(release, defense.protect(secret, public, np.random.default_rng(2))), "another rng gave the same release"
+    privacy = defense.privacy(public)
+    assert privacy.guarantee
+    assert privacy.epsilon is None or privacy.epsilon >= 0
+    assert privacy.log10_true is None or privacy.log10_true <= 0
+
+
+def check_applicability(attack: Attack, defense: Defense, extractor: Extractor, public: Public) -> bool:
+    """Whether an attack applies is stated, twice alike, and with a reason if not. Returns it."""
+    task = Reconstruction()
+    reason = task.inapplicable(defense, attack, extractor, public)
+    assert reason is None or reason.strip(), "an attack that does not apply says why"
+    assert reason == task.inapplicable(defense, attack, extractor, public)
+    return reason is None
+
+
+def check_attack(attack: Attack, defense: Defense, extractor: Extractor, secret: Features) -> None:
+    """An attack that applies returns what it should, and knows the release and public knowledge alone.
+
+    What it returns must be bit-identical when the secret and the caches are overwritten after the release.
+    """
+    cached: list[Indices] = []
+
+    def quantise(known: dictionary.Dictionary, rows: Any) -> Indices:
+        cached.append(known.index.nearest(rows))
+        return cached[-1]
+
+    public = Public(quantise)
+    mine = copy.deepcopy(secret)
+    release = defense.protect(mine, public, np.random.default_rng(1))
+    first = _estimate(attack, defense, release, extractor, public)
+    if isinstance(attack, DescriptorAttack):
+        assert first.shape == secret.descriptors.shape
+        np.testing.assert_allclose(np.linalg.norm(first, axis=1), 1, atol=TOLERANCE)
+    else:
+        assert first.shape == (*secret.size[::-1], 3)
+        assert first.min() >= 0
+        assert first.max() <= 1
+    assert first.dtype == np.float32
+    for array in (*_arrays(mine), *cached):
+        array[...] = 0
+    public.forget()
+    assert np.array_equal(first, _estimate(attack, defense, release, extractor, public)), "the attack saw more than the release"
+
+
+def check_metric(metric: Metric, seed: int = 0) -> None:
+    """A metric keeps its range, changes nothing, and prefers the truth to an estimate."""
+    rng = np.random.default_rng(seed)
+    if metric.compares == "images":
+        truth = rng.random((48, 40, 3), dtype=np.float32)
+        estimate = np.clip(truth + rng.normal(0, 0.1, truth.shape), 0, 1).astype(np.float32)
+    else:
+        truth, estimate = example_features(30, seed).descriptors, example_features(30, seed + 1).descriptors
+    before = truth.copy(), estimate.copy()
+    perfect, value = metric(truth, truth.copy()), metric(truth, estimate)
+    assert np.array_equal(truth, before[0])
+    assert np.array_equal(estimate, before[1])
+    low, high = metric.range
+    assert isinstance(value, float)
+    assert low <= value <= high
+    assert perfect is None or low <= perfect <= high
+    best = (high if metric.higher_is_better_for == "attacker" else low) if perfect is None else perfect
+    assert best > value if metric.higher_is_better_for == "attacker" else best < value, "the truth must be the best estimate"
+
+
+def check_extractor(extractor: Extractor, image: np.ndarray, source: Path | None = None) -> None:
+    """An extractor gives unit descriptors at keypoints within the image, by position, and each time the same."""
+    before = image.copy()
+    features = extractor.extract(image, source)
+    assert np.array_equal(image, before)
+    assert same(features, extractor.extract(image, source))
+    height, width = image.shape[:2]
+    assert features.size == (width, height)
+    assert len(features) > 0
+    assert features.keypoints.shape == (len(features), 2)
+    assert (features.keypoints >= 0).all()
+    assert (features.keypoints <= features.size).all()
+    np.testing.assert_allclose(np.linalg.norm(features.descriptors, axis=1), 1, atol=TOLERANCE)
+    assert features.codes is None or same_array(unit_rows(features.codes), features.descriptors)
+    assert same(features, features.by_position()), "the order of keypoints would tell what is not released"
+
+
+def same(one: Any, other: Any) -> bool:
+    """Whether two dataclasses of arrays are equal bit for bit."""
+    values = [(getattr(one, field.name), getattr(other, field.name)) for field in dataclasses.fields(one)]
+    return all(same_array(a, b) if isinstance(a, np.ndarray) else a == b for a, b in values)
+
+
+def same_array(one: np.ndarray, other: np.ndarray) -> bool:
+    return one.dtype == other.dtype and np.array_equal(one, other)
+
+
+def _estimate(attack: Attack, defense: Defense, release: Release, extractor: Extractor, public: Public) -> Floats:
+    seen = view(attack, defense, release, extractor, public)
+    rng = np.random.default_rng(3)
+    if isinstance(attack, DescriptorAttack):
+        return attack.recover(seen, rng)
+    assert isinstance(attack, ImageAttack)
+    return attack.reconstruct(seen, rng)
+
+
+def _arrays(value: Any) -> list[np.ndarray]:
+    found = [getattr(value, field.name) for field in dataclasses.fields(value)]
+    return [array for array in found if isinstance(array, np.ndarray)]
+
+
+def _shared(release: Release, secret: Features) -> bool:
+    return any(np.shares_memory(mine, theirs) for mine in _arrays(release) for theirs in _arrays(secret))
+
+
+def _check_release(release: Release, count: int) -> None:
+    for array in _arrays(release):
+        assert len(array) == count
+        assert np.isfinite(array).all()
+        assert array.dtype in (np.float32, np.int64)
+    if isinstance(release, Descriptors):
+        np.testing.assert_allclose(np.linalg.norm(release.descriptors, axis=1), 1, atol=TOLERANCE)
+    if isinstance(release, Subspaces):
+        gram = np.einsum("nid,njd->nij", release.bases, release.bases)  # (N, dim, dim)
+        np.testing.assert_allclose(gram, np.broadcast_to(np.eye(release.dim), gram.shape), atol=TOLERANCE)
+    if isinstance(release, WordSets):
+        np.testing.assert_allclose(np.linalg.norm(release.candidates, axis=2), 1, atol=TOLERANCE)
+        assert release.words is None or (np.diff(release.words, axis=1) > 0).all(), "words must ascend, each once"

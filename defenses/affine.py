@@ -1,0 +1,134 @@
+"""Affine subspace lifting (Dusmanu et al., CVPR 2021; the paper's Sec. 3).
+
+A descriptor d becomes D = d + span(d_1, ..., d_dim), where d_i = a_i − d for an adversarial descriptor a_i of the database,
+or d_i ~ U([-1, 1])^n. Of D, a fresh origin and a fresh basis are released, made from D and random vectors alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.errors import UnitError, UserError
+from bench.kernels.search import unit_rows
+from bench.kernels.subset import draw_distinct
+from bench.plugin import Asset, Between, Defense, OneOf, Privacy
+from bench.public import Public
+from bench.types import Bytes, Features, Floats, Subspaces
+
+Doubles = NDArray[np.float64]
+
+# A direction that leaves the span of those before it by less than this (of its length) adds no dimension.
+DEGENERATE = 1e-6
+TRIES = 100
+
+
+@dataclass(frozen=True, kw_only=True)
+class Affine(Defense):
+    """Releases a random affine subspace through the descriptor and, unless lifting=random, through words of a database.
+
+    The adversarial words of a photograph come from one sub-database, drawn for it; those of a keypoint are distinct.
+    """
+
+    releases = Subspaces
+    serves: ClassVar[Mapping[str, Between | OneOf]] = {"dim": OneOf((2, 4, 6, 8, 10, 12, 14, 16))}
+
+    lifting: Literal["random", "adversarial", "hybrid"] = "hybrid"  # none, all or half of the directions lead to words
+    dim: int = 4  # of the subspace
+    sub_databases: int = 16  # parts of the database
+    database: Asset = Asset("shipped")
+
+    def __post_init__(self) -> None:
+        if self.lifting not in ("random", "adversarial", "hybrid"):
+            raise UserError(f"affine: lifting must be random, adversarial or hybrid, got {self.lifting}")
+        if self.dim < 1:
+            raise UserError(f"affine: dim must be at least 1, got {self.dim}")
+        if self.lifting == "hybrid" and self.dim % 2:
+            raise UserError(f"affine: dim must be even where half of it is adversarial, got {self.dim}")
+        if self.sub_databases < 1:
+            raise UserError(f"affine: sub_databases must be at least 1, got {self.sub_databases}")
+
+    @property
+    def adversarial(self) -> int:
+        """Words that a subspace goes through."""
+        return {"random": 0, "hybrid": self.dim // 2, "adversarial": self.dim}[self.lifting]
+
+    def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> Subspaces:
+        length = secret.descriptors.shape[1]
+        if self.dim >= length:
+            raise UserError(f"affine: dim must be below the descriptors' length, {length}, got {self.dim}")
+        words = self._sub_database(length, public, rng)
+        d = secret.descriptors.astype(np.float64)  # (N, D)
+        span = lift(d, words, self.adversarial, self.dim, rng)  # (N, dim, D)
+        origins, bases = reparameterise(d, span, rng)
+        return Subspaces(keypoints=secret.keypoints.copy(), size=secret.size, origins=origins, bases=bases)
+
+    def privacy(self, public: Public) -> Privacy:
+        return Privacy("none")
+
+    def _sub_database(self, length: int, public: Public, rng: np.random.Generator) -> Bytes:
+        """The words that one photograph draws from. -> (S, D)"""
+        if self.adversarial == 0:
+            return np.empty((0, length), dtype=np.uint8)
+        database = public.dictionary(self.database)
+        if database.words.shape[1] != length:
+            raise UserError(f"affine: the descriptors have length {length}, the database's words {database.words.shape[1]}")
+        smallest = len(database) // self.sub_databases
+        if smallest < self.adversarial:
+            raise UserError(
+                f"affine: {self.adversarial} words a keypoint, but {len(database)} words in {self.sub_databases} "
+                f"sub-databases leave {smallest} each"
+            )
+        return database.sub_database(int(rng.integers(self.sub_databases)), self.sub_databases)
+
+
+def lift(d: Doubles, words: Bytes, adversarial: int, dim: int, rng: np.random.Generator) -> Doubles:
+    """Orthonormal bases of the directions of D. (N, D), (S, D) -> (N, dim, D)
+
+    Where a word is the descriptor itself, or the directions are otherwise short of `dim` dimensions, all are drawn again.
+
+    Raises
+    ------
+    UnitError
+        if they still are after TRIES draws: the sub-database has too few words that differ from the descriptor.
+    """
+    rows, length = d.shape
+    span = np.empty((rows, length, dim))
+    waiting = np.arange(rows)
+    for _ in range(TRIES):
+        directions = np.empty((len(waiting), dim, length))
+        a = unit_rows(words[draw_distinct(len(waiting), len(words), adversarial, rng)])  # (waiting, adversarial, D)
+        directions[:, :adversarial] = a - d[waiting, None]
+        directions[:, adversarial:] = rng.uniform(-1, 1, (len(waiting), dim - adversarial, length))
+        lengths = np.linalg.norm(directions, axis=2)  # (waiting, dim)
+        span[waiting], triangle = np.linalg.qr(directions.transpose(0, 2, 1))
+        gained = np.abs(np.diagonal(triangle, axis1=1, axis2=2))  # (waiting, dim) what each adds to those before it
+        waiting = waiting[(gained <= DEGENERATE * lengths).any(axis=1)]
+        if len(waiting) == 0:
+            return span.transpose(0, 2, 1)
+    raise UnitError(f"affine: a descriptor lies in the span of every draw of {adversarial} words of its sub-database")
+
+
+def reparameterise(d: Doubles, span: Doubles, rng: np.random.Generator) -> tuple[Floats, Floats]:
+    """A fresh origin and orthonormal basis of d + span, which depend on nothing else. -> (N, D), (N, dim, D)
+
+    The origin is the projection onto D of e_0, the basis that of e_1, ..., e_dim onto the directions of D, orthonormalised;
+    all e ~ U([-1, 1])^n. A projection onto D is the same whatever point and basis D was described by.
+    """
+    rows, dim, length = span.shape
+    e = rng.uniform(-1, 1, (rows, 1 + dim, length))
+    e[:, 0] -= d
+    coordinates = e @ span.transpose(0, 2, 1)  # (N, 1 + dim, dim) of the projections in `span`
+    origins = d + (coordinates[:, :1] @ span)[:, 0]
+    mixing, triangle = np.linalg.qr(coordinates[:, 1:].transpose(0, 2, 1))  # (N, dim, dim) twice
+    # LAPACK's signs depend on `span`, and would tell on which side of D the secret lies. Gram-Schmidt's do not.
+    mixing *= np.sign(np.diagonal(triangle, axis1=1, axis2=2))[:, None]
+    bases = mixing.transpose(0, 2, 1) @ span
+    return origins.astype(np.float32), bases.astype(np.float32)
+
+
+PLUGIN = Affine

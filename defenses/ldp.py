@@ -1,0 +1,63 @@
+"""LDP-Feat: the ω-subset mechanism on a dictionary of descriptors (Sec. 5.2, Steps 1 to 3; Eq. (5); Theorem 1)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from bench.errors import UserError
+from bench.features.dictionary import Dictionary
+from bench.kernels.search import unit_rows
+from bench.kernels.subset import log10_chance, word_subsets
+from bench.plugin import Asset, Between, Defense, OneOf, Privacy
+from bench.public import Public
+from bench.types import Features, WordSets
+
+
+@dataclass(frozen=True, kw_only=True)
+class LDP(Defense):
+    """Releases a random set of words, the descriptor's nearest among them with a probability that epsilon sets.
+
+    `epsilon=inf` always releases the nearest word, with `subset_size` - 1 random ones: quantisation, and no guarantee.
+    """
+
+    releases = WordSets
+    serves: ClassVar[Mapping[str, Between | OneOf]] = {"epsilon": Between(8.0, 16.0), "subset_size": OneOf((1, 2, 3, 4))}
+    quantised_by: ClassVar[str | None] = "dictionary"
+
+    epsilon: float = 10.0  # nats, per descriptor
+    subset_size: int = 2  # words released per keypoint
+    dictionary: Asset = Asset("shipped")
+
+    def __post_init__(self) -> None:
+        if not self.epsilon >= 0:  # NaN is refused too
+            raise UserError(f"ldp: epsilon must be at least 0, got {self.epsilon}")
+        if self.subset_size < 1:
+            raise UserError(f"ldp: subset_size must be at least 1, got {self.subset_size}")
+
+    def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> WordSets:
+        known = self._known(public)
+        nearest = public.nearest_words(self.dictionary, secret)  # (N,) d'
+        words = word_subsets(nearest, len(known), self.epsilon, self.subset_size, rng)  # (N, m)
+        candidates = unit_rows(known.words[words])  # (N, m, D)
+        return WordSets(keypoints=secret.keypoints.copy(), size=secret.size, candidates=candidates, words=words)
+
+    def privacy(self, public: Public) -> Privacy:
+        log10_true = log10_chance(self.epsilon, len(self._known(public)), self.subset_size)
+        if math.isinf(self.epsilon):
+            return Privacy("none", log10_true=log10_true)
+        return Privacy("epsilon-ldp", self.epsilon, log10_true)
+
+    def _known(self, public: Public) -> Dictionary:
+        """The dictionary, once it is known to hold enough words."""
+        known = public.dictionary(self.dictionary)
+        if len(known) < self.subset_size:
+            raise UserError(f"ldp: subset_size is {self.subset_size}, but the dictionary has {len(known)} words")
+        return known
+
+
+PLUGIN = LDP

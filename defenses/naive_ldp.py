@@ -1,0 +1,75 @@
+"""Naive LDP: the ω-subset mechanism on the full descriptor space (Sec. 5.2, "Naive Approach").
+
+K is the set of all bit patterns of a descriptor: |K| = 2^(8·128) for uint8, 2^(32·128) for float32. The mechanism draws
+patterns; what follows, reading them as descriptors, sees nothing but its output and so costs no privacy.
+
+Rule for patterns that are no descriptor: a component that is NaN or infinite is read as 0; the row is then scaled to unit
+norm in float64; a row of zeros stays zero.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from bench.errors import UserError
+from bench.kernels.search import unit_rows
+from bench.kernels.subset import log10_chance, pattern_subsets
+from bench.plugin import Defense, Privacy
+from bench.public import Public
+from bench.types import Bytes, Features, Floats, WordSets
+
+LENGTH = 128  # of a descriptor; |K| rests on it
+BITS = {"uint8": 8, "float32": 32}
+
+
+@dataclass(frozen=True, kw_only=True)
+class NaiveLDP(Defense):
+    """Releases a random set of bit patterns, almost never the descriptor's own."""
+
+    releases = WordSets
+
+    epsilon: float = 10.0  # nats, per descriptor
+    subset_size: int = 2  # patterns released per keypoint
+    element: Literal["uint8", "float32"] = "uint8"  # what a descriptor is made of
+
+    def __post_init__(self) -> None:
+        if not self.epsilon >= 0:  # NaN is refused too
+            raise UserError(f"naive-ldp: epsilon must be at least 0, got {self.epsilon}")
+        if self.subset_size < 1:
+            raise UserError(f"naive-ldp: subset_size must be at least 1, got {self.subset_size}")
+        if self.element not in BITS:
+            raise UserError(f"naive-ldp: element must be uint8 or float32, got {self.element}")
+
+    def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> WordSets:
+        patterns = pattern_subsets(self._patterns(secret), self.epsilon, self.subset_size, rng)  # (N, m, B)
+        candidates = unit_rows(patterns if self.element == "uint8" else finite_floats(patterns))  # (N, m, D)
+        return WordSets(keypoints=secret.keypoints.copy(), size=secret.size, candidates=candidates, words=None)
+
+    def privacy(self, public: Public) -> Privacy:
+        log10_true = log10_chance(self.epsilon, 2 ** (BITS[self.element] * LENGTH), self.subset_size)
+        if math.isinf(self.epsilon):
+            return Privacy("none", log10_true=log10_true)
+        return Privacy("epsilon-ldp", self.epsilon, log10_true)
+
+    def _patterns(self, secret: Features) -> Bytes:
+        """The descriptors as bytes. -> (N, B)"""
+        if secret.descriptors.shape[1] != LENGTH:
+            raise UserError(f"naive-ldp: descriptors must have length {LENGTH}, got {secret.descriptors.shape[1]}")
+        if self.element == "float32":
+            return secret.descriptors.astype("<f4").view(np.uint8)
+        if secret.codes is None:
+            raise UserError("naive-ldp: these features are floats without 8-bit codes; use element=float32")
+        return secret.codes
+
+
+def finite_floats(patterns: Bytes) -> Floats:
+    """Read patterns as float32, NaN and infinities as 0. (N, m, 4 D) -> (N, m, D)"""
+    values = patterns.view("<f4")
+    return np.where(np.isfinite(values), values, np.float32(0))
+
+
+PLUGIN = NaiveLDP

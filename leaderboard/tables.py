@@ -1,0 +1,259 @@
+"""Records made into tables: one row for each defense and attack; for a terminal, as Markdown, and as CSV."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import pandas as pd
+
+from bench import registry
+from bench.listing import described
+from bench.records import Record, canonical, latest
+
+if TYPE_CHECKING:
+    from rich.table import Table as RichTable
+
+Configuration = dict[str, Any] | None
+
+NOT_APPLICABLE = "n/a"
+# The metrics that come first, in this order; others follow by name.
+PAPER = ("mae", "mse", "ssim", "psnr")
+FIRST = ("keypoints", *PAPER)
+SEEDED = "Releases are seeded: they are for measuring, and not private."
+COMPOSED = "ε/image: the median; the keypoints of a photograph compose; their positions are released in the clear."
+SHOWN_FAILURES = 10
+LEFT_TO_FILES = ("keypoints", "MSE", "angle", "l2")  # columns that a terminal has no room for
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """A summary of records of one task, dataset and seed.
+
+    `frame` has a row for each cell: defense, attack, photographs (done), failed, the mean of each metric over the photographs
+    that have it, epsilon_descriptor, epsilon_image (median), log10_true, note. What does not apply is missing, and `note`
+    says why.
+    """
+
+    heading: str
+    frame: pd.DataFrame
+    metrics: tuple[str, ...]
+    failures: tuple[str, ...]
+
+
+def tables(records: Iterable[Record]) -> list[Table]:
+    """Summarise the latest records, one table for each task, dataset (with its extractor) and seed."""
+    groups = _grouped(latest(records), lambda record: [record["task"], record["dataset"], record["seed"]])
+    return [_table(group) for group in groups]
+
+
+def labels(pairs: Sequence[tuple[Configuration, Configuration]]) -> list[tuple[str, str]]:
+    """Short names for defenses and attacks, `ldp:epsilon=10,subset_size=2`; with digests only where pairs would look alike."""
+    short = [(_label(defense), _label(attack)) for defense, attack in pairs]
+    written = [canonical(pair) for pair in pairs]
+    seen: dict[tuple[str, str], set[str]] = {}
+    for names, content in zip(short, written, strict=True):
+        seen.setdefault(names, set()).add(content)
+    return [
+        (_label(defense, digests=True), _label(attack, digests=True)) if len(seen[names]) > 1 else names
+        for (defense, attack), names in zip(pairs, short, strict=True)
+    ]
+
+
+def to_markdown(table: Table) -> str:
+    """The table with its heading, the metrics' directions and the failures."""
+    shown = rendered(table)
+    lines = [
+        f"**{table.heading}**",
+        "",
+        _markdown_row(shown.columns),
+        _markdown_row("---" for _ in shown.columns),
+        *(_markdown_row(row) for row in shown.itertuples(index=False)),
+        "",
+        *(f"- {line}" for line in (*explanations(table), *_failures(table))),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def to_csv(found: Sequence[Table]) -> str:
+    """All tables in one, with full precision; the heading is a column."""
+    frames = [table.frame.assign(heading=table.heading) for table in found]
+    return pd.concat(frames).to_csv(index=False, na_rep=NOT_APPLICABLE, lineterminator="\n")
+
+
+def to_rich(table: Table, *, foldable: bool = False) -> RichTable:
+    """The table for a terminal: the paper's metrics and what was recovered of descriptors; notes stand beneath, by number.
+
+    `foldable` labels may be broken between fields, and can no longer be copied into a command.
+    """
+    from rich.table import Table as RichTable
+    from rich.text import Text
+
+    shown = rendered(table).drop(columns=list(LEFT_TO_FILES), errors="ignore")
+    notes = [note for note in dict.fromkeys(shown.pop("note")) if note]
+    numbers = {note: f" [{number}]" for number, note in enumerate(notes, start=1)}
+    shown["attack"] += [numbers.get(note, "") for note in table.frame["note"]]
+    lines = [f"[{number}] {note}" for number, note in enumerate(notes, start=1)]
+    caption = "\n".join((*lines, *_failures(table), COMPOSED, SEEDED))
+    drawn = RichTable(title=Text(table.heading), caption=Text(caption), title_justify="left", caption_justify="left")
+    for column in shown.columns:
+        drawn.add_column(column, overflow="fold", justify="left" if column in ("defense", "attack") else "right")
+    for row in shown.itertuples(index=False):
+        drawn.add_row(*(Text(spaced(cell) if foldable else cell) for cell in row))
+    return drawn
+
+
+def spaced(label: str) -> str:
+    """A label that can be broken between fields."""
+    return label.replace(":", ": ").replace(",", ", ")
+
+
+def rendered(table: Table) -> pd.DataFrame:
+    """The frame as text, as people read it."""
+    frame = table.frame
+    plain = frame[["defense", "attack"]].assign(n=frame["photographs"].map(_count))
+    if (frame["failed"] > 0).any():
+        plain["failed"] = frame["failed"].map(_count)
+    for name in table.metrics:
+        plain[name.upper() if name in PAPER else name] = frame[name].map(_number)
+    plain["ε/descriptor"] = frame["epsilon_descriptor"].map(_number)
+    plain["ε/image"] = frame["epsilon_image"].map(_number)
+    plain["Pr(true)"] = frame["log10_true"].map(_chance)
+    plain["note"] = frame["note"]
+    return plain
+
+
+def explanations(table: Table) -> list[str]:
+    """What the numbers are, in lines."""
+    known = {metric.name(): metric for metric in registry.everything(registry.METRIC)}
+    lines = [f"{name}: {described(known[name])}" for name in table.metrics if name in known]
+    return [*lines, COMPOSED, SEEDED]
+
+
+def extractor_label(configuration: dict[str, Any]) -> str:
+    """An extractor's name, and whether its descriptors are upright or oriented where that is a question."""
+    words = {True: " upright", False: " oriented"}
+    return configuration["name"] + words.get(configuration.get("upright"), "")  # type: ignore[arg-type]
+
+
+def _table(records: list[Record]) -> Table:
+    first = records[0]
+    units = {record["unit"] for record in records if record["status"] != "n/a"}
+    dataset = first["dataset"]
+    heading = (
+        f"{first['task'].capitalize()} on {dataset['name']} ({len(units)} {'photograph' if len(units) == 1 else 'photographs'}), "
+        f"{extractor_label(dataset['extractor'])} features, seed {first['seed']}"
+    )
+    cells = _grouped(records, lambda record: [record["defense"], record["attack"], record["run_hash"]])
+    metrics = _metric_names(records)
+    names = labels([(cell[0]["defense"], cell[0]["attack"]) for cell in cells])
+    rows = [_row(cell, *pair, metrics) for cell, pair in zip(cells, names, strict=True)]
+    frame = pd.DataFrame(rows).astype({"photographs": "Int64", "failed": "Int64"})
+    failures = tuple(
+        f"{record['unit']}, {defense}, {attack}: {record['reason']}"
+        for cell, (defense, attack) in zip(cells, names, strict=True)
+        for record in cell
+        if record["status"] == "failed"
+    )
+    return Table(heading, frame, metrics, failures)
+
+
+def _row(cell: list[Record], defense: str, attack: str, metrics: Sequence[str]) -> dict[str, Any]:
+    done = [record for record in cell if record["status"] == "ok"]
+    privacy = cell[0]["privacy"]
+    return {
+        "defense": defense,
+        "attack": attack,
+        "photographs": None if cell[0]["status"] == "n/a" else len(done),
+        "failed": None if cell[0]["status"] == "n/a" else len(cell) - len(done),
+        **{name: _mean(record["metrics"].get(name) for record in done) for name in metrics},
+        "epsilon_descriptor": _float(privacy["epsilon_descriptor"]),
+        "epsilon_image": _median(record["privacy"]["epsilon_image"] for record in done),
+        "log10_true": _float(privacy["log10_true"]),
+        "note": "; ".join(_notes(cell)),
+    }
+
+
+def _notes(cell: list[Record]) -> list[str]:
+    """Why the cell does not apply, or what all its photographs share."""
+    if cell[0]["status"] == "n/a":
+        return [cell[0]["reason"]]
+    done = [record for record in cell if record["status"] == "ok"]
+    shared = [note for note in (done[0]["notes"] if done else []) if all(note in record["notes"] for record in done)]
+    return shared if done else ["no photograph could be done"]
+
+
+def _metric_names(records: list[Record]) -> tuple[str, ...]:
+    """Of the metrics, those that some record has a value of."""
+    found = {name for record in records for name, value in record["metrics"].items() if value is not None}
+    return (*(name for name in FIRST if name in found), *sorted(found - set(FIRST)))
+
+
+def _grouped(records: Iterable[Record], key: Callable[[Record], Any]) -> list[list[Record]]:
+    groups: dict[str, list[Record]] = {}
+    for record in records:
+        groups.setdefault(canonical(key(record)), []).append(record)
+    return list(groups.values())
+
+
+def _label(configuration: Configuration, *, digests: bool = False) -> str:
+    if configuration is None:
+        return "none needed"
+    shown = [
+        f"{name}={_short(value)}" for name, value in configuration.items() if name != "name" and (digests or _telling(value))
+    ]
+    return configuration["name"] + (":" + ",".join(shown) if shown else "")
+
+
+def _telling(value: Any) -> bool:
+    return not isinstance(value, dict) and value is not None and not str(value).startswith(("sha256:", "shipped"))
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, dict):
+        return _label(value, digests=True)
+    if isinstance(value, float):
+        return f"{value:g}"
+    return value.removeprefix("sha256:")[:8] if str(value).startswith("sha256:") else str(value)
+
+
+def _failures(table: Table) -> list[str]:
+    more = len(table.failures) - SHOWN_FAILURES
+    return [f"failed: {line}" for line in table.failures[:SHOWN_FAILURES]] + ([f"and {more} more"] if more > 0 else [])
+
+
+def _float(value: float | str | None) -> float:
+    return math.nan if value is None else float(value)
+
+
+def _known(values: Iterable[float | str | None]) -> pd.Series:
+    return pd.Series([float(value) for value in values if value is not None], dtype=float)
+
+
+def _mean(values: Iterable[float | str | None]) -> float:
+    return float(_known(values).mean())
+
+
+def _median(values: Iterable[float | str | None]) -> float:
+    return float(_known(values).median())
+
+
+def _count(value: Any) -> str:
+    return NOT_APPLICABLE if pd.isna(value) else str(value)
+
+
+def _number(value: float) -> str:
+    return NOT_APPLICABLE if math.isnan(value) else "∞" if math.isinf(value) else f"{value:.4g}"
+
+
+def _chance(log10: float) -> str:
+    """A probability from its decimal logarithm, which may be far below what a float can hold."""
+    if math.isnan(log10):
+        return NOT_APPLICABLE
+    return f"{10**log10:.4g}" if log10 > -5 else f"10^{log10:.1f}"
+
+
+def _markdown_row(cells: Iterable[Any]) -> str:
+    return "| " + " | ".join(str(cell).replace("|", "\\|").replace("\n", " ") for cell in cells) + " |"

@@ -1,0 +1,36 @@
+"""Structural similarity of an image (Wang et al., 2004); one of the three metrics of the paper's Tables 1 and 4."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any, ClassVar, Literal
+
+from bench.kernels.pairs import image_pair
+from bench.plugin import Metric
+from bench.types import Floats
+
+
+@dataclass(frozen=True, kw_only=True)
+class SSIM(Metric):
+    """Structural similarity, with the window and the constants of its authors, averaged over the channels."""
+
+    compares: ClassVar[Literal["images", "descriptors"]] = "images"
+    unit: ClassVar[str] = "similarity"
+    range: ClassVar[tuple[float, float]] = (-1.0, 1.0)
+    higher_is_better_for: ClassVar[Literal["attacker", "defender"]] = "attacker"
+    # SSIM is a family; a number means nothing without these. Both sides of an image must have 11 pixels, the window's width.
+    parameters: ClassVar[Mapping[str, Any]] = MappingProxyType(
+        {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 1.0, "channel_axis": 2}
+    )
+
+    def __call__(self, truth: Floats, estimate: Floats) -> float:
+        from skimage.metrics import structural_similarity
+
+        # (H, W, 3) in [0, 1] each
+        true, estimated = image_pair(truth, estimate)
+        return float(structural_similarity(true, estimated, **self.parameters))
+
+
+PLUGIN = SSIM
