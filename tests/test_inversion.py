@@ -1,0 +1,343 @@
+"""The inversion network: encoding, loss, training that resumes exactly, weights, and the rule about quantised photographs."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from skimage.metrics import structural_similarity
+
+from attacks.inversion import data, weights
+from attacks.inversion.encoding import Points, condition, encode, stack
+from attacks.inversion.loss import reconstruction_loss, ssim
+from attacks.inversion.network import Inverter, Shape, paint
+from attacks.inversion.train import Training, check_quantisation, train
+from bench.cli import main
+from bench.datasets import photographs
+from bench.errors import UserError
+from bench.features import build, dictionary
+from bench.features.sift import Sift
+from bench.features.views import collect
+from bench.plugin import Asset, Between, OneOf
+from bench.public import Public
+from bench.types import Descriptors, Subspaces, WordSets
+from defenses.affine import Affine, reparameterise
+from defenses.ldp import LDP
+from defenses.none import Undefended
+
+TINY = Training(steps=6, batch=2, warmup=2)
+
+
+@pytest.fixture(scope="module")
+def sources():
+    return photographs.builtin()
+
+
+@pytest.fixture(scope="module")
+def album(sources, tmp_path_factory):
+    """Two photographs to train on, in a folder."""
+    folder = tmp_path_factory.mktemp("album")
+    for source in sources[:2]:
+        (folder / source.path.name).write_bytes(source.path.read_bytes())
+    return folder
+
+
+@pytest.fixture(scope="module")
+def words(album, tmp_path_factory):
+    """A dictionary made from the two photographs of the album."""
+    path = tmp_path_factory.mktemp("k") / "K.safetensors"
+    build.build(album, 3000, path, Sift(), seed=0)
+    return Asset(path)
+
+
+def example_releases(rng, count=5):
+    where = {"keypoints": rng.uniform(0, 256, (count, 2)).astype(np.float32), "size": (256, 256)}
+    unit = rng.normal(size=(count, 3, 128)).astype(np.float32)
+    return [
+        Descriptors(**where, descriptors=unit[:, 0]),
+        WordSets(**where, candidates=unit, words=None),
+        Subspaces(**where, origins=unit[:, 0], bases=unit[:, 1:]),
+    ]
+
+
+def test_every_kind_of_release_has_a_stacking(rng):
+    assert [stack(release).shape[1] for release in example_releases(rng)] == [1, 3, 17]
+    with pytest.raises(TypeError, match="no stacking"):
+        stack(object())
+
+
+def test_subspaces_are_read_as_themselves_and_not_as_they_were_written(rng):
+    """Two re-parameterisations of one D stack alike; two different D do not (negative control)."""
+    d = rng.normal(size=(20, 128))
+    span = np.linalg.qr(rng.normal(size=(20, 128, 6)))[0].transpose(0, 2, 1)
+    where = {"keypoints": np.zeros((20, 2), np.float32), "size": (256, 256)}
+
+    def stacked(point):
+        origins, bases = reparameterise(point, span, rng)
+        return stack(Subspaces(**where, origins=origins, bases=bases))
+
+    first = stacked(d)
+    np.testing.assert_allclose(first, stacked(d), atol=1e-5)
+    np.testing.assert_allclose(first, stacked(d + rng.normal(size=(20, 1)) * span[:, 0]), atol=1e-5)
+    assert np.abs(first - stacked(rng.normal(size=(20, 128)))).max() > 0.1
+
+
+def test_encoding_pads_and_places(rng):
+    release = example_releases(rng)[1]
+    points = encode([release, release], [np.array([0.25], np.float32)] * 2, slots=4)
+    assert points.values.shape == (10, 4 * 128 + 2 + 1)
+    assert (points.values[:, 3 * 128 : 4 * 128] == 0).all()
+    assert (points.values[:, -1] == 0.25).all()
+    row, column = int(release.keypoints[0, 1] // 2), int(release.keypoints[0, 0] // 2)
+    assert points.cells[0] == row * 128 + column
+    assert points.cells[5] == 128 * 128 + row * 128 + column
+    with pytest.raises(ValueError, match="at most 2"):
+        encode([release], [np.empty(0, np.float32)], slots=2)
+
+
+def test_keypoints_on_the_border_stay_in_the_grid():
+    corners = np.array([[0, 0], [256, 256], [-1, 300]], np.float32)
+    release = Descriptors(keypoints=corners, size=(256, 256), descriptors=np.zeros((3, 128), np.float32))
+    points = encode([release], [np.empty(0, np.float32)], slots=1)
+    assert points.cells.tolist() == [0, 128 * 128 - 1, 127 * 128]
+
+
+def test_conditions_are_the_served_settings():
+    served = {"epsilon": Between(8.0, 16.0), "subset_size": OneOf((1, 2, 3, 4))}
+    assert np.allclose(condition(LDP(epsilon=10, subset_size=4), served), [0.25, 1.0])
+    assert condition(Undefended(), {}).shape == (0,)
+
+
+def test_keypoints_that_share_a_cell_are_added_up(rng):
+    """The rule of `network.py`, whatever the order of the keypoints."""
+    net = Inverter(Shape(inputs=130)).eval()
+    values = torch.from_numpy(rng.normal(size=(3, 130)).astype(np.float32))
+    cells = torch.tensor([7, 7, 9])
+    with torch.inference_mode():
+        grid = net.scatter(Points(values, cells, 1, (16, 16)))[0].flatten(1)  # (C, 256)
+        one = net.embed(values)
+    torch.testing.assert_close(grid[:-1, 7], one[0] + one[1])
+    assert grid[-1, [7, 9, 8]].tolist() == [2, 1, 0]
+    swapped = Points(values.flip(0), cells.flip(0), 1, (16, 16))
+    torch.testing.assert_close(net.scatter(swapped)[0].flatten(1), grid)
+
+
+def test_ssim_of_the_loss_is_scikit_images(rng):
+    a, b = rng.random((2, 64, 64)).astype(np.float32)
+    settings = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 1.0}
+    full = structural_similarity(a, b, full=True, **settings)[1][5:-5, 5:-5].mean()
+    ours = float(ssim(torch.from_numpy(a)[None], torch.from_numpy(b)[None]))
+    assert ours == pytest.approx(full, abs=1e-5)
+    other = structural_similarity(a, b, full=True, **settings | {"sigma": 1.0})[1][5:-5, 5:-5].mean()
+    assert ours != pytest.approx(other, abs=1e-4)  # negative control: the comparison tells settings apart
+
+
+def test_loss_of_the_truth_is_zero(rng):
+    image = torch.from_numpy(rng.random((1, 3, 64, 64)).astype(np.float32))
+    assert float(reconstruction_loss(image, image)) == pytest.approx(0, abs=1e-6)
+    assert float(reconstruction_loss(1 - image, image)) > 0.1
+
+
+@pytest.mark.parametrize("defense", [Undefended(), Affine(lifting="random", dim=2)])
+def test_a_resumed_training_is_the_same_training(defense, sources, tmp_path, monkeypatch):
+    import attacks.inversion.train as module
+
+    monkeypatch.setattr(module, "CHECKPOINT_EVERY", 3)
+    given = {"photographs": sources[:2], "validation": sources[2:3], "extractor": Sift(), "training": TINY}
+    whole = train(defense, {}, out=tmp_path / "whole.safetensors", **given)
+    # Interrupt the second one after its third step.
+    advance, steps = module._Trainer._advance, []
+
+    def interrupted(self, points, pixels):
+        if len(steps) == 4:
+            raise KeyboardInterrupt
+        steps.append(1)
+        return advance(self, points, pixels)
+
+    monkeypatch.setattr(module._Trainer, "_advance", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        train(defense, {}, out=tmp_path / "parts.safetensors", **given)
+    monkeypatch.setattr(module._Trainer, "_advance", advance)
+    parts = train(defense, {}, out=tmp_path / "parts.safetensors", **given)
+    a, b = weights.load(tmp_path / "whole.safetensors"), weights.load(tmp_path / "parts.safetensors")
+    assert a.digest == b.digest
+    assert whole["validation"] == parts["validation"]
+    other = train(defense, {}, out=tmp_path / "other.safetensors", **given | {"training": dataclasses.replace(TINY, seed=1)})
+    assert other["validation"] != whole["validation"]  # negative control
+
+
+@pytest.mark.parametrize(("slots", "candidates"), [(1, 1), (3, 1), (4, 4)])
+def test_a_network_started_from_another_reads_a_descriptor_as_it_does(slots, candidates, rng):
+    """A release whose first slot holds the descriptor is painted as by the network for raw descriptors."""
+    trained, fresh = Inverter(Shape(inputs=130)).eval(), Inverter(Shape(inputs=slots * 128 + 2 + 1)).eval()
+    weights.start_from(fresh, trained, candidates)
+    raw = example_releases(rng)[0]
+    rows = np.zeros((len(raw), slots, 128), np.float32)
+    rows[:, 0] = raw.descriptors * np.float32(candidates**0.5)
+    padded = WordSets(keypoints=raw.keypoints, size=raw.size, candidates=rows, words=None)
+    mine = fresh(encode([padded], [np.ones(1, np.float32)], slots))
+    theirs = trained(encode([raw], [np.empty(0, np.float32)], 1))
+    torch.testing.assert_close(mine, theirs, atol=1e-4, rtol=1e-4)
+    assert not torch.allclose(Inverter(Shape(inputs=130)).eval()(encode([raw], [np.empty(0, np.float32)], 1)), theirs, atol=1e-2)
+
+
+def test_training_learns(sources, tmp_path):
+    """Forty steps on two photographs bring the loss well below that of the first."""
+    import attacks.inversion.train as module
+
+    losses = []
+
+    class Watched(module._Trainer):
+        def _advance(self, points, pixels):
+            losses.append(super()._advance(points, pixels))
+            return losses[-1]
+
+    original, module._Trainer = module._Trainer, Watched
+    try:
+        training = Training(steps=40, batch=2, warmup=5)
+        train(
+            Undefended(),
+            {},
+            photographs=sources[:2],
+            validation=sources[2:3],
+            out=tmp_path / "W",
+            extractor=Sift(),
+            training=training,
+        )
+    finally:
+        module._Trainer = original
+    assert np.mean(losses[-5:]) < 0.75 * np.mean(losses[:5])
+
+
+def test_a_checkpoint_of_another_training_is_refused(sources, tmp_path, monkeypatch):
+    import attacks.inversion.train as module
+
+    given = {"photographs": sources[:2], "validation": sources[2:3], "extractor": Sift(), "out": tmp_path / "W.safetensors"}
+    monkeypatch.setattr(module.weights, "save", lambda *_: (_ for _ in ()).throw(OSError("the disk is full")))
+    with pytest.raises(OSError, match="disk"):
+        train(Undefended(), {}, training=TINY, **given)
+    with pytest.raises(UserError, match="another training"):
+        train(Undefended(), {}, training=dataclasses.replace(TINY, seed=1), **given)
+
+
+def test_photographs_in_both_sets_are_refused(sources, tmp_path):
+    with pytest.raises(UserError, match="in both"):
+        train(Undefended(), {}, photographs=sources[:2], validation=sources[1:2], out=tmp_path / "W", extractor=Sift())
+
+
+def test_own_photographs_quantise_to_nearly_themselves(sources, words):
+    """Negative control of the rule: a network trained on its own dictionary's photographs fails the check."""
+    public = Public()
+    own, unseen = collect(sources[:2], Sift()), collect(sources[2:4], Sift())
+    chosen = {view.photograph: words for view in own + unseen}
+    known, unknown = (data.quantisation_error(views, chosen, public) for views in (own, unseen))
+    assert known < 0.9 * unknown
+    with pytest.raises(UserError, match="trust words"):
+        check_quantisation(known, unknown)
+    check_quantisation(0.98 * unknown, unknown)
+
+
+def test_a_photograph_is_never_quantised_by_its_own_dictionary(sources, words, tmp_path):
+    public = Public()
+    inside, outside = sources[0].content_hash(), sources[3].content_hash()
+    with pytest.raises(UserError, match="--crossfit"):
+        data.fitting_dictionaries({inside, outside}, [words], public)
+    stranger = Asset(tmp_path / "other.safetensors")
+    dictionary.save(stranger_path := tmp_path / "other.safetensors", public.dictionary(words).words[:2000], {"photographs": []})
+    assert stranger_path.is_file()
+    assert data.fitting_dictionaries({inside, outside}, [words, stranger], public) == {inside: stranger, outside: words}
+
+
+def test_quantisation_once_is_quantisation_each_time(sources, words):
+    views = collect(sources[3:4], Sift())
+    chosen = {view.photograph: words for view in views}
+    table, plain = data.quantise(views, chosen, Public()), Public()
+    for view in views:
+        expected = plain.nearest_words(words, view.features)
+        assert np.array_equal(table(plain.dictionary(words), view.features.codes), expected)
+    with pytest.raises(KeyError):
+        table(plain.dictionary(words), np.full((1, 128), 7, np.uint8))
+
+
+def test_crops_keep_what_lies_within(sources, rng):
+    view = max(collect(sources[:1], Sift()), key=lambda view: len(view.pixels))
+    place = {tuple(code): number for number, code in enumerate(view.features.codes)}
+    for _ in range(10):
+        pixels, features = data._random_crop(view, rng)
+        offsets = view.features.keypoints[[place[tuple(code)] for code in features.codes]] - features.keypoints
+        left, top = np.rint(np.median(offsets, axis=0)).astype(int)
+        assert np.array_equal(pixels, view.pixels[top : top + 256, left : left + 256])
+        inside = ((view.features.keypoints >= (left, top)) & (view.features.keypoints < (left + 256, top + 256))).all(axis=1)
+        assert np.array_equal(features.codes, view.features.codes[inside])
+
+
+def test_a_network_knows_what_it_was_trained_for(sources, words, tmp_path):
+    public, path = Public(), tmp_path / "W.safetensors"
+    served = {"epsilon": Between(8.0, 16.0), "subset_size": OneOf((1, 2))}
+    shape = Shape(inputs=2 * 128 + 2 + 2)
+    meta = {**weights.describe(LDP(dictionary=words), served, Sift(), public), "slots": 2}
+    weights.save(path, Inverter(shape), shape, meta)
+    found = weights.load(path).meta
+    fits = LDP(epsilon=9, subset_size=2, dictionary=words)
+    assert weights.misfit(found, fits, Sift(), public) is None
+    for other, extractor, reason in [
+        (dataclasses.replace(fits, epsilon=20), Sift(), "epsilon 8 to 16, not 20"),
+        (dataclasses.replace(fits, subset_size=3), Sift(), "subset_size 1, 2, not 3"),
+        (Undefended(), Sift(), "trained for ldp"),
+        (fits, Sift(upright=False), "features with upright True, not False"),
+    ]:
+        assert reason in (weights.misfit(found, other, extractor, public) or "")
+    copied = tmp_path / "other.safetensors"
+    dictionary.save(copied, public.dictionary(words).words[::-1], {"photographs": []})
+    assert "dictionary sha256" in (weights.misfit(found, LDP(dictionary=Asset(copied)), Sift(), public) or "")
+
+
+def test_weights_keep_the_network(sources, tmp_path, rng):
+    shape = Shape(inputs=130)
+    net = Inverter(shape).eval()
+    path = tmp_path / "W.safetensors"
+    weights.save(path, net, shape, {"slots": 1, "serves": {}})
+    points = encode([example_releases(rng)[0]], [np.empty(0, np.float32)], slots=1)
+    torch.testing.assert_close(paint(weights.load(path).module, points), paint(net, points), atol=0.02, rtol=0)
+    assert torch.equal(paint(net, points), paint(net, points))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda arrays: {name: array.astype(np.int32) for name, array in arrays.items()}, "int32, expected float16"),
+        (lambda arrays: {name: array[..., :1] for name, array in arrays.items()}, "has shape"),
+        (lambda arrays: dict(list(arrays.items())[1:]), "nothing, expected"),
+    ],
+)
+def test_weights_that_do_not_fit(spoil, message, tmp_path):
+    from bench import tensorfile
+
+    shape, path = Shape(inputs=130), tmp_path / "W.safetensors"
+    weights.save(path, Inverter(shape), shape, {"slots": 1, "serves": {}})
+    arrays, meta, _ = tensorfile.load(path, weights.KIND)
+    tensorfile.save(path, weights.KIND, spoil(arrays), meta)
+    with pytest.raises(UserError, match=message):
+        weights.load(path)
+
+
+def test_from_the_command_line(album, tmp_path, sources, capsys):
+    held = tmp_path / "held"
+    held.mkdir()
+    (held / "coffee.png").write_bytes(sources[2].path.read_bytes())
+    out = tmp_path / "W.safetensors"
+    command = ["train", "--defense", "none", "--images", str(album), "--validation", str(held), "--out", str(out)]
+    assert main([*command, "--steps", "2", "--batch", "2"]) == 0
+    assert "4 crops of 2 photographs" in capsys.readouterr().out
+    before = out.read_bytes()
+    assert main([*command, "--steps", "2", "--batch", "2"]) == 0  # done is done
+    again = tmp_path / "again.safetensors"
+    assert main([*command[:-1], str(again), "--steps", "2", "--batch", "2", "--start", str(out)]) == 0
+    assert weights.load(again).meta["start"] == weights.load(out).digest
+    assert main([*command, "--steps", "3", "--batch", "2"]) == 2
+    assert "another training" in capsys.readouterr().err.splitlines()[-1]
+    assert out.read_bytes() == before
+    assert (
+        main(["run", "--defense", "none", "--attack", f"dia:weights={out}", "--images", str(held), "--out", str(tmp_path / "r")])
+        == 0
+    )

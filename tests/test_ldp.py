@@ -1,0 +1,505 @@
+"""LDP-Feat and the exact ω-subset mechanism beneath it, against enumeration, rational arithmetic and theory.
+
+A statistical check passes at a p-value above ALPHA, with fixed seeds. Each has a control: a wrong mechanism that fails it.
+"""
+
+import math
+from collections.abc import Callable
+from fractions import Fraction
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from bench.errors import UserError
+from bench.features import dictionary
+from bench.kernels.search import unit_rows
+from bench.kernels.subset import chance_digits, draw_distinct, draw_told, log10_chance, word_subsets
+from bench.plugin import Asset, Privacy
+from bench.public import Public
+from bench.types import Features
+from defenses.ldp import PLUGIN as LDP
+
+ALPHA = 1e-4
+CERTAINLY_WRONG = 1e-9
+
+Sampler = Callable[[np.ndarray, int, float, int, np.random.Generator], np.ndarray]
+
+
+# ---- references that share nothing with the implementation
+
+
+def exp_bounds(power: Fraction, terms: int) -> tuple[Fraction, Fraction]:
+    """e^power from Taylor's series in rationals; the remainder is below the last term, once terms > 2 power."""
+    total = term = Fraction(1)
+    for n in range(1, max(terms, math.ceil(2 * power) + 2)):
+        term = term * power / n
+        total += term
+    return total, total + term
+
+
+def chance_bounds(epsilon: float, domain: int, size: int, terms: int = 160) -> tuple[Fraction, Fraction]:
+    """Eq. (5) in rationals."""
+    bounds = exp_bounds(Fraction(repr(epsilon)), terms)
+    low, high = (size * power / (size * power + domain - size) for power in bounds)
+    return low, high
+
+
+def short(value: Any) -> str:
+    """A parameter's name in pytest's output."""
+    return f"2^{value.bit_length() - 1}" if isinstance(value, int) and value > 2**60 else str(value)
+
+
+def chance(epsilon: float, domain: int, size: int) -> float:
+    weight = size * math.exp(epsilon)
+    return weight / (weight + domain - size)
+
+
+def enumerated(epsilon: float, domain: int, size: int) -> dict[tuple[int, ...], list[float]]:
+    """Pr(Z | v) for all sets Z and all v, with the normalisation of DESIGN.md."""
+    total = size * math.exp(epsilon) + domain - size
+    inside, outside = (domain * weight / total / math.comb(domain, size) for weight in (math.exp(epsilon), 1.0))
+    return {Z: [inside if v in Z else outside for v in range(domain)] for Z in combinations(range(domain), size)}
+
+
+# ---- p, digit by digit
+
+
+@pytest.mark.parametrize("epsilon", [0.1, 1.0, 8.0, 10.0, 12.5, 16.0, 30.0])
+@pytest.mark.parametrize(("domain", "size"), [(6, 2), (256_000, 2), (256_000, 4), (2**1024, 2)], ids=short)
+def test_digits_of_p_against_rational_arithmetic(epsilon: float, domain: int, size: int) -> None:
+    low, high = chance_bounds(epsilon, domain, size)
+    for bits in (1, 64, 128, 192):
+        expected = math.floor(low * 2**bits)
+        assert expected == math.floor(high * 2**bits), "the reference is not fine enough"
+        assert chance_digits(epsilon, domain, size, bits) == expected
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    epsilon=st.floats(0, 20, allow_subnormal=False).filter(lambda e: e == 0 or e > 1e-6),
+    domain=st.integers(2, 10**6),
+    share=st.floats(0, 1),
+)
+def test_digits_of_p_against_rational_arithmetic_anywhere(epsilon: float, domain: int, share: float) -> None:
+    size = max(1, round(share * domain))
+    low, high = chance_bounds(epsilon, domain, size)
+    digits = chance_digits(epsilon, domain, size, 64)
+    assert math.floor(low * 2**64) <= digits <= math.floor(high * 2**64)
+
+
+def test_epsilon_is_the_decimal_that_it_is_written_as() -> None:
+    """The double 0.1 is not one tenth; their p differ from the 58th digit on."""
+    low, high = chance_bounds(0.1, 6, 2)
+    binary = [2 * power / (2 * power + 4) for power in exp_bounds(Fraction(0.1), 160)]
+    digits = chance_digits(0.1, 6, 2, 128)
+    assert math.floor(low * 2**128) == digits == math.floor(high * 2**128)
+    assert digits != math.floor(binary[0] * 2**128)
+
+
+@pytest.mark.parametrize("epsilon", [100, 1000.0, 1e6, 1e17, 1.7e308])
+@pytest.mark.parametrize("domain", [6, 256_000, 2**1024, 2**4096], ids=short)
+def test_large_epsilon_neither_overflows_nor_reaches_one(epsilon: float, domain: int) -> None:
+    digits = chance_digits(epsilon, domain, 2, 64)
+    odds = math.log2(domain) - 1 - epsilon / math.log(2)  # about log2 of (1 - p) / p
+    if odds < -64:
+        assert digits == 2**64 - 1
+    elif odds > 64:
+        assert digits == 0
+    assert log10_chance(epsilon, domain, 2) <= 0
+    # Far enough, the expansion shows that p is not 1; as long as the digits can be written out.
+    if epsilon <= 1000:
+        assert 0 < chance_digits(epsilon, domain, 2, 8192) < 2**8192 - 1
+
+
+def test_special_cases_of_p() -> None:
+    assert chance_digits(0.0, 6, 2, 64) == 2**64 // 3  # p = m / K
+    assert chance_digits(5e-324, 4, 2, 64) == 2**63  # just above one half
+    assert chance_digits(math.inf, 6, 2, 64) == 2**64  # p = 1
+    assert chance_digits(1.0, 3, 3, 64) == 2**64
+    assert log10_chance(math.inf, 6, 2) == 0.0 == log10_chance(1.0, 3, 3)
+
+
+@pytest.mark.parametrize(
+    ("epsilon", "domain", "size"), [(0.0, 6, 2), (10.0, 256_000, 2), (10.0, 2**1024, 2), (16.0, 256_000, 4)], ids=short
+)
+def test_log10_of_p(epsilon: float, domain: int, size: int) -> None:
+    low, _ = chance_bounds(epsilon, domain, size)
+    expected = math.log10(low.numerator) - math.log10(low.denominator)
+    assert log10_chance(epsilon, domain, size) == pytest.approx(expected, rel=1e-12, abs=1e-12)
+
+
+# ---- the Bernoulli draw
+
+
+class Scripted:
+    """A generator whose bits are given numbers of 320 bits, one a row, handed out to the rows that still equal p."""
+
+    def __init__(self, numbers: list[int], chance: int) -> None:
+        self.numbers, self.chance, self.calls = numbers, chance, 0
+
+    def integers(self, low: int, *, size: int, dtype: Any, endpoint: bool) -> np.ndarray:
+        assert (low, dtype, endpoint) == (2**64 - 1, np.uint64, True)
+        known = 320 - 64 * self.calls  # bits not yet handed out
+        undecided = [number for number in self.numbers if number >> known == self.chance >> known]
+        assert len(undecided) == size
+        self.calls += 1
+        return np.array([number >> (known - 64) & (2**64 - 1) for number in undecided], dtype=np.uint64)
+
+
+@pytest.mark.parametrize(
+    ("epsilon", "domain", "size"),
+    [(10.0, 256_000, 2), (0.1, 6, 3), (40.0, 7, 2), (10.0, 2**128, 2), (10.0, 2**4096, 2)],
+    ids=short,
+)
+def test_draw_goes_on_where_the_bits_equal_those_of_p(epsilon: float, domain: int, size: int) -> None:
+    low, high = chance_bounds(epsilon, domain, size, terms=400)
+    digits = math.floor(low * 2**320)
+    assert digits == math.floor(high * 2**320), "the reference is not fine enough"
+    near = [digits + sign * 2**place for place in (319, 255, 200, 150, 70, 63, 10, 0) for sign in (-1, 1)]
+    numbers = [number for number in near if 0 <= number < 2**320]
+    expected = [Fraction(number, 2**320) < low for number in numbers]
+    rng = Scripted(numbers, digits)
+    told = draw_told(len(numbers), epsilon, domain, size, rng)  # type: ignore[arg-type]
+    assert told.tolist() == expected
+    assert rng.calls == 5
+    # The control: 64 bits alone decide wrongly, unless p is so small that no row is told either way.
+    assert [number >> 256 < digits >> 256 for number in numbers] != expected or not any(expected)
+
+
+def test_draw_of_certainty_and_of_nothing() -> None:
+    rng = np.random.default_rng(0)
+    assert draw_told(1000, math.inf, 6, 2, rng).all()
+    assert draw_told(1000, 3.0, 2, 2, rng).all()
+    assert draw_told(0, 3.0, 6, 2, rng).shape == (0,)
+    assert not draw_told(1000, 10.0, 2**4096, 2, rng).any()
+
+
+# ---- the distribution of the sets
+
+
+def subsets_fit(sampler: Sampler, domain: int, size: int, epsilon: float, draws: int = 10**6, true: int = 2) -> float:
+    """p-value of χ² between `draws` sets and the enumeration."""
+    rng = np.random.default_rng([domain, size, int(epsilon * 10)])
+    words = sampler(np.full(draws, true), domain, epsilon, size, rng)
+    law = enumerated(epsilon, domain, size)
+    codes = np.bincount((np.sort(words, axis=1) * domain ** np.arange(size)).sum(axis=1), minlength=domain**size)
+    observed = [int(codes[sum(word * domain**place for place, word in enumerate(Z))]) for Z in law]
+    assert sum(observed) == draws, "a row is no set of `size` words"
+    expected = [draws * by_word[true] for by_word in law.values()]
+    return float(stats.chisquare(observed, expected).pvalue)
+
+
+CASES = [(6, 2, 0.0), (6, 2, 1.0), (6, 2, 3.0), (6, 3, 0.0), (6, 3, 1.0), (6, 3, 3.0), (6, 1, 1.0), (5, 4, 2.0)]
+
+
+@pytest.mark.parametrize(("domain", "size", "epsilon"), CASES)
+def test_sets_against_enumeration(domain: int, size: int, epsilon: float) -> None:
+    assert subsets_fit(word_subsets, domain, size, epsilon) > ALPHA
+
+
+def test_enumeration_sums_to_one_and_its_ratio_is_e_to_the_epsilon() -> None:
+    for domain, size, epsilon in CASES:
+        law = enumerated(epsilon, domain, size)
+        np.testing.assert_allclose(np.sum(list(law.values()), axis=0), 1.0, rtol=1e-12)
+        ratio = max(max(row) / min(row) for row in law.values())
+        assert ratio == pytest.approx(math.exp(epsilon), rel=1e-12)
+        # Definition 2 as printed has ω in place of |K|, and does not.
+        printed = np.sum([np.array(row) * size / domain for row in law.values()], axis=0)
+        np.testing.assert_allclose(printed, size / domain, rtol=1e-12)
+
+
+def mechanism_with(wrong_chance: Callable[[float, int, int], float]) -> Sampler:
+    """The mechanism with another p."""
+
+    def sample(true: np.ndarray, domain: int, epsilon: float, size: int, rng: np.random.Generator) -> np.ndarray:
+        told = rng.random(len(true)) < wrong_chance(epsilon, domain, size)
+        words = np.empty((len(true), size), dtype=np.int64)
+        for u in (False, True):
+            others = draw_distinct(int((told == u).sum()), domain - 1, size - u, rng)
+            words[told == u, int(u) :] = others + (others >= true[told == u, None])
+        words[told, 0] = true[told]
+        return words
+
+    return sample
+
+
+def true_word_first(true: np.ndarray, domain: int, epsilon: float, size: int, rng: np.random.Generator) -> np.ndarray:
+    """The mechanism with the right law of sets, but with an order that tells."""
+    return mechanism_with(chance)(true, domain, epsilon, size, rng)
+
+
+def test_the_control_mechanism_is_sound_with_the_right_p() -> None:
+    assert subsets_fit(mechanism_with(chance), 6, 2, 1.0) > ALPHA
+
+
+@pytest.mark.parametrize("size", [2, 3])
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        lambda e, domain, m: chance(e, domain + 1, m),  # |K| off by one
+        lambda e, domain, m: m * math.exp(e) / (m * math.exp(e) + domain),  # |K| for |K| − m
+        lambda e, domain, m: math.exp(e) / (math.exp(e) + domain - 1),  # k-ary randomised response
+        lambda e, domain, m: m / domain * chance(e, domain, m),  # Definition 2 as printed
+        lambda e, domain, m: chance(e + 0.02, domain, m),  # a little more than was promised
+    ],
+    ids=["larger K", "K for K - m", "k-RR", "printed", "epsilon + .02"],
+)
+def test_control_a_wrong_p_fails(wrong: Callable[[float, int, int], float], size: int) -> None:
+    assert subsets_fit(mechanism_with(wrong), 6, size, 1.0) < CERTAINLY_WRONG
+
+
+def test_control_others_that_may_be_the_true_word_fail() -> None:
+    def unshifted(true: np.ndarray, domain: int, epsilon: float, size: int, rng: np.random.Generator) -> np.ndarray:
+        """Draws the others from all of K where u = 0."""
+        told = draw_told(len(true), epsilon, domain, size, rng)
+        words = word_subsets(true, domain, math.inf, size, rng)
+        words[~told] = draw_distinct(int((~told).sum()), domain, size, rng)
+        return words
+
+    assert subsets_fit(unshifted, 6, 2, 1.0) < CERTAINLY_WRONG
+
+
+def sampled_ratio(epsilon: float, domain: int, size: int, told: Fraction) -> Fraction:
+    """Greatest Pr(Z | v1) / Pr(Z | v2) of the mechanism's steps: u with probability `told`, then a uniform set of others."""
+    law = {
+        Z: [told / math.comb(domain - 1, size - 1) if v in Z else (1 - told) / math.comb(domain - 1, size) for v in range(domain)]
+        for Z in combinations(range(domain), size)
+    }
+    assert all(sum(row[v] for row in law.values()) == 1 for v in range(domain))
+    return max(max(row) / min(row) for row in law.values())
+
+
+@pytest.mark.parametrize(("domain", "size", "epsilon"), [case for case in CASES if case[0] > case[1]])
+def test_ratio_of_any_two_words_is_e_to_the_epsilon_and_no_more(domain: int, size: int, epsilon: float) -> None:
+    told = Fraction(chance_digits(epsilon, domain, size, 256), 2**256)
+    bounds = exp_bounds(Fraction(repr(epsilon)), 160)
+    assert abs(sampled_ratio(epsilon, domain, size, told) - bounds[0]) < Fraction(1, 2**200)
+
+
+def test_control_a_ratio_of_a_wrong_p_exceeds_e_to_the_epsilon() -> None:
+    told = Fraction(chance(1.0, 6, 2)) + Fraction(1, 10**6)
+    assert sampled_ratio(1.0, 6, 2, told) > exp_bounds(Fraction(1), 60)[1]
+
+
+def test_inclusion_at_full_size() -> None:
+    """At |K| = 256,000, ε = 10 and m = 2 the true word is told with probability .1468; all others are equally likely."""
+    domain, size, epsilon, draws = 256_000, 2, 10.0, 400_000
+    rng = np.random.default_rng(0)
+    true = rng.integers(domain, size=draws)
+    words = word_subsets(true, domain, epsilon, size, rng)
+    told = (words == true[:, None]).any(axis=1)
+    expected = chance(epsilon, domain, size)
+    assert expected == pytest.approx(0.1468, abs=1e-4)
+    assert stats.binomtest(int(told.sum()), draws, expected).pvalue > ALPHA
+    assert stats.binomtest(int(told.sum()), draws, chance(10.05, domain, size)).pvalue < ALPHA  # the control
+    # The others' distance from the true word is uniform on 1 .. |K| − 1.
+    distance = ((words - true[:, None]) % domain)[words != true[:, None]]
+    assert distance.min() > 0
+    counts = np.bincount((distance - 1) * 100 // (domain - 1), minlength=100)
+    ends = np.ceil(np.arange(101) * (domain - 1) / 100)
+    assert stats.chisquare(counts, counts.sum() * np.diff(ends) / (domain - 1)).pvalue > ALPHA
+
+
+@settings(max_examples=80, deadline=None)
+@given(domain=st.integers(1, 40), data=st.data())
+def test_distinct_numbers_are_distinct_and_in_range(domain: int, data: st.DataObject) -> None:
+    size = data.draw(st.integers(0, domain))
+    drawn = draw_distinct(20, domain, size, np.random.default_rng(data.draw(st.integers(0, 2**32))))
+    assert drawn.shape == (20, size)
+    assert all(len(set(row)) == size for row in drawn.tolist())
+    assert size == 0 or (drawn.min() >= 0 and drawn.max() < domain)
+
+
+def test_more_distinct_numbers_than_there_are() -> None:
+    with pytest.raises(ValueError, match="3 distinct numbers were asked for, but there are 2"):
+        draw_distinct(1, 2, 3, np.random.default_rng(0))
+
+
+@settings(max_examples=80, deadline=None)
+@given(domain=st.integers(1, 40), epsilon=st.floats(0, 50) | st.just(math.inf), data=st.data())
+def test_every_row_is_a_set_of_words(domain: int, epsilon: float, data: st.DataObject) -> None:
+    size = data.draw(st.integers(1, domain))
+    true = np.array(data.draw(st.lists(st.integers(0, domain - 1), max_size=20)), dtype=np.int64)
+    words = word_subsets(true, domain, epsilon, size, np.random.default_rng(data.draw(st.integers(0, 2**32))))
+    assert words.shape == (len(true), size)
+    assert (np.diff(words, axis=1) > 0).all()
+    assert words.size == 0 or (words.min() >= 0 and words.max() < domain)
+    if math.isinf(epsilon) or size == domain:
+        assert (words == true[:, None]).any(axis=1).all()
+
+
+# ---- order
+
+
+def order_fits(sampler: Sampler, domain: int = 1000, size: int = 3) -> float:
+    """p-value of: where the true word is told, it stands in each place equally often. True words are uniform."""
+    rng = np.random.default_rng(5)
+    true = rng.integers(domain, size=200_000)
+    words = sampler(true, domain, 5.0, size, rng)
+    places = np.nonzero(words == true[:, None])[1]
+    return float(stats.chisquare(np.bincount(places, minlength=size)).pvalue)
+
+
+def test_order_carries_nothing() -> None:
+    assert order_fits(word_subsets) > ALPHA
+    words = word_subsets(np.arange(1000), 1000, 5.0, 4, np.random.default_rng(0))
+    assert (np.diff(words, axis=1) > 0).all()  # a function of the set alone
+
+
+def test_control_the_true_word_first_is_caught() -> None:
+    assert subsets_fit(true_word_first, 6, 2, 1.0) > ALPHA  # the sets alone do not show it
+    assert order_fits(true_word_first) < CERTAINLY_WRONG
+
+
+# ---- the plugin
+
+
+def make_dictionary(path: Path, size: int) -> Asset:
+    words = np.random.default_rng(1).integers(1, 150, size=(size, 128), dtype=np.uint8)
+    dictionary.save(path / f"{size}.safetensors", words, {"photographs": []})
+    return Asset(path / f"{size}.safetensors")
+
+
+def make_features(count: int, seed: int = 0) -> Features:
+    rng = np.random.default_rng(seed)
+    codes = rng.integers(1, 150, size=(count, 128), dtype=np.uint8)
+    keypoints = rng.uniform(0, 64, (count, 2)).astype(np.float32)
+    return Features(keypoints=keypoints, descriptors=unit_rows(codes), codes=codes, size=(64, 48))
+
+
+def nearest_by_hand(secret: Features, words: np.ndarray) -> np.ndarray:
+    assert secret.codes is not None
+    cosines = secret.codes.astype(float) @ words.astype(float).T / np.linalg.norm(words.astype(float), axis=1)
+    return cosines.argmax(axis=1)
+
+
+def test_releases_words_and_nothing_of_the_secret(tmp_path: Path) -> None:
+    asset = make_dictionary(tmp_path, 300)
+    secret, public = make_features(50), Public()
+    release = LDP(dictionary=asset, subset_size=3).protect(secret, public, np.random.default_rng(0))
+    words = public.dictionary(asset).words
+    assert release.words is not None
+    assert release.words.shape == (50, 3)
+    assert (np.diff(release.words, axis=1) > 0).all()
+    np.testing.assert_array_equal(release.candidates, unit_rows(words[release.words]))
+    np.testing.assert_allclose(np.linalg.norm(release.candidates, axis=2), 1, atol=1e-6)
+    assert (release.candidates.dtype, release.words.dtype) == (np.float32, np.int64)
+    assert release.size == secret.size
+    kept = [array.copy() for array in (release.keypoints, release.candidates, release.words)]
+    np.testing.assert_array_equal(release.keypoints, secret.keypoints)
+    for array in (secret.keypoints, secret.descriptors, secret.codes, public.nearest_words(asset, secret), words):
+        assert array is not None
+        array[:] = 0
+    for before, after in zip(kept, (release.keypoints, release.candidates, release.words), strict=True):
+        np.testing.assert_array_equal(before, after)
+
+
+def test_is_a_function_of_the_generator(tmp_path: Path) -> None:
+    defense, secret = LDP(dictionary=make_dictionary(tmp_path, 300)), make_features(50)
+    first, again, other = (defense.protect(secret, Public(), np.random.default_rng(seed)).words for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first, again)
+    assert (first != other).any()
+
+
+def test_infinite_epsilon_is_quantisation(tmp_path: Path) -> None:
+    asset = make_dictionary(tmp_path, 300)
+    secret, public = make_features(50), Public()
+    nearest = nearest_by_hand(secret, public.dictionary(asset).words)
+    alone = LDP(dictionary=asset, epsilon=math.inf, subset_size=1).protect(secret, public, np.random.default_rng(0))
+    np.testing.assert_array_equal(alone.words, nearest[:, None])
+    more = LDP(dictionary=asset, epsilon=math.inf, subset_size=4).protect(secret, public, np.random.default_rng(0))
+    assert more.words is not None
+    assert (more.words == nearest[:, None]).any(axis=1).all()
+    assert LDP(dictionary=asset, epsilon=math.inf).privacy(public) == Privacy("none", None, 0.0)
+
+
+def test_the_plugins_sets_against_enumeration(tmp_path: Path) -> None:
+    """The same χ² for what the plugin releases, true words of all kinds together."""
+    asset = make_dictionary(tmp_path, 6)
+    secret, public = make_features(20_000), Public()
+    nearest = nearest_by_hand(secret, public.dictionary(asset).words)
+    release = LDP(dictionary=asset, epsilon=1.0, subset_size=2).protect(secret, public, np.random.default_rng(3))
+    assert release.words is not None
+    law = enumerated(1.0, 6, 2)
+    table = np.zeros((6, len(law)), dtype=int)
+    columns = {Z: column for column, Z in enumerate(law)}
+    for true, Z in zip(nearest.tolist(), map(tuple, release.words.tolist()), strict=True):
+        table[true, columns[Z]] += 1
+    expected = table.sum(axis=1, keepdims=True) * np.array(list(law.values())).T
+    used = table.sum(axis=1) > 0
+    assert used.sum() >= 3
+    statistic = ((table - expected)[used] ** 2 / expected[used]).sum()
+    assert stats.chi2.sf(statistic, used.sum() * (len(law) - 1)) > ALPHA
+    # The control: read as a release of ε = 1.2, it does not fit.
+    other = table.sum(axis=1, keepdims=True) * np.array(list(enumerated(1.2, 6, 2).values())).T
+    assert stats.chi2.sf(((table - other)[used] ** 2 / other[used]).sum(), used.sum() * (len(law) - 1)) < ALPHA
+
+
+def test_privacy_states_epsilon_and_the_chance_of_the_true_word(tmp_path: Path) -> None:
+    promised = LDP(dictionary=make_dictionary(tmp_path, 300), epsilon=4, subset_size=3).privacy(Public())
+    assert (promised.guarantee, promised.epsilon) == ("epsilon-ldp", 4)
+    assert promised.log10_true == pytest.approx(math.log10(chance(4, 300, 3)), rel=1e-12)
+
+
+def test_as_many_words_as_the_dictionary_has(tmp_path: Path) -> None:
+    defense = LDP(dictionary=make_dictionary(tmp_path, 4), subset_size=4)
+    release = defense.protect(make_features(10), Public(), np.random.default_rng(0))
+    np.testing.assert_array_equal(release.words, np.tile(np.arange(4), (10, 1)))
+    assert defense.privacy(Public()).log10_true == 0.0
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"epsilon": -1}, "ldp: epsilon must be at least 0, got -1"),
+        ({"epsilon": math.nan}, "ldp: epsilon must be at least 0, got nan"),
+        ({"epsilon": -math.inf}, "ldp: epsilon must be at least 0, got -inf"),
+        ({"subset_size": 0}, "ldp: subset_size must be at least 1, got 0"),
+    ],
+)
+def test_wrong_configuration(wrong: dict, message: str) -> None:
+    with pytest.raises(UserError) as caught:
+        LDP(**wrong)
+    assert str(caught.value) == message
+
+
+def test_a_dictionary_that_does_not_do(tmp_path: Path) -> None:
+    small = LDP(dictionary=make_dictionary(tmp_path, 3), subset_size=4)
+    for use in (
+        lambda: small.privacy(Public()),
+        lambda: small.protect(make_features(5), Public(), np.random.default_rng(0)),
+    ):
+        with pytest.raises(UserError, match="ldp: subset_size is 4, but the dictionary has 3 words"):
+            use()
+    longer = Features(
+        keypoints=np.ones((2, 2), np.float32), descriptors=np.eye(2, 256, dtype=np.float32), codes=None, size=(9, 9)
+    )
+    with pytest.raises(UserError, match=r"descriptors have length 256, the words of .* 128"):
+        LDP(dictionary=make_dictionary(tmp_path, 3)).protect(longer, Public(), np.random.default_rng(0))
+    with pytest.raises(UserError, match="no such file"):
+        LDP(dictionary=Asset(tmp_path / "missing")).privacy(Public())
+
+
+def test_floats_without_codes_are_quantised_too(tmp_path: Path) -> None:
+    asset, secret = make_dictionary(tmp_path, 300), make_features(20)
+    floats = Features(keypoints=secret.keypoints, descriptors=secret.descriptors, codes=None, size=secret.size)
+    one = LDP(dictionary=asset, epsilon=math.inf, subset_size=1)
+    np.testing.assert_array_equal(
+        one.protect(floats, Public(), np.random.default_rng(0)).words,
+        nearest_by_hand(secret, Public().dictionary(asset).words)[:, None],
+    )
+
+
+def test_an_attacker_is_trained_for_what_is_served() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        LDP(**{name: setting.sample(rng) for name, setting in LDP.serves.items()})
+    assert 12.0 in LDP.serves["epsilon"]
+    assert math.inf not in LDP.serves["epsilon"]
+    assert 5 not in LDP.serves["subset_size"]

@@ -1,0 +1,221 @@
+"""Metrics against scikit-image, against arithmetic on paper, and against chance."""
+
+import math
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+from skimage import metrics as reference
+
+from bench.plugin import Metric
+from metrics import angle, l2, mae, mse, psnr, recovered, ssim
+
+IMAGES = [mae.PLUGIN, mse.PLUGIN, psnr.PLUGIN, ssim.PLUGIN]
+DESCRIPTORS = [angle.PLUGIN, l2.PLUGIN, recovered.PLUGIN]
+
+
+@pytest.fixture(params=[(0, 0.02), (1, 0.3), (2, 1.0)], ids=["close", "noisy", "unlike"])
+def images(request: Any) -> tuple[np.ndarray, np.ndarray]:
+    """A smooth image and a disturbed one. (H, W, 3) float32 in [0, 1]"""
+    seed, noise = request.param
+    rng = np.random.default_rng(seed)
+    waves = np.sin(np.linspace(0, 9, 48)[:, None, None] * rng.uniform(0.5, 2, 3)) * np.cos(np.linspace(0, 7, 40)[None, :, None])
+    truth = (waves + 1) / 2
+    estimate = np.clip(truth + rng.normal(0, noise, truth.shape), 0, 1)
+    return truth.astype(np.float32), estimate.astype(np.float32)
+
+
+def unit(rows: np.ndarray) -> np.ndarray:
+    return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
+
+
+# ---- images
+
+
+def test_image_errors_equal_scikit_image(images: tuple[np.ndarray, np.ndarray]) -> None:
+    truth, estimate = images
+    exact = truth.astype(np.float64), estimate.astype(np.float64)
+    assert mse.PLUGIN()(truth, estimate) == pytest.approx(reference.mean_squared_error(*exact), abs=1e-12)
+    expected = reference.peak_signal_noise_ratio(*exact, data_range=1.0)
+    assert psnr.PLUGIN()(truth, estimate) == pytest.approx(expected, abs=1e-6)
+    by_hand = math.fsum(abs(float(a) - float(b)) for a, b in zip(truth.flat, estimate.flat, strict=True)) / truth.size
+    assert mae.PLUGIN()(truth, estimate) == pytest.approx(by_hand, abs=1e-12)
+
+
+def ssim_by_definition(truth: np.ndarray, estimate: np.ndarray) -> float:
+    """Wang et al.'s formula with scipy's Gaussian, away from the border that scikit-image leaves out too."""
+    from scipy.ndimage import gaussian_filter
+
+    blur = partial(gaussian_filter, sigma=(1.5, 1.5, 0), truncate=3.5, mode="reflect")
+    x, y = truth.astype(np.float64), estimate.astype(np.float64)
+    mx, my = blur(x), blur(y)
+    vx, vy, vxy = blur(x * x) - mx * mx, blur(y * y) - my * my, blur(x * y) - mx * my
+    c1, c2 = 0.01**2, 0.03**2
+    similarity = (2 * mx * my + c1) * (2 * vxy + c2) / ((mx * mx + my * my + c1) * (vx + vy + c2))
+    return float(similarity[5:-5, 5:-5].mean())
+
+
+def same_ssim(metric: Any, images: tuple[np.ndarray, np.ndarray]) -> bool:
+    """The check that SSIM must pass: both references, to 1e-6."""
+    value = metric(*images)
+    library = reference.structural_similarity(
+        *(image.astype(np.float64) for image in images),
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        data_range=1,
+        channel_axis=2,
+    )
+    return abs(value - library) < 1e-6 and abs(value - ssim_by_definition(*images)) < 1e-6
+
+
+def test_ssim_equals_both_references(images: tuple[np.ndarray, np.ndarray]) -> None:
+    assert same_ssim(ssim.PLUGIN(), images)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"gaussian_weights": False},  # scikit-image's default, a uniform window
+        {"use_sample_covariance": True},
+        {"sigma": 1.0},
+        {"data_range": 2.0},  # what is assumed of floats where it is not given
+    ],
+    ids=str,
+)
+def test_control_ssim_with_other_settings_fails(images: tuple[np.ndarray, np.ndarray], other: dict) -> None:
+    wrong = partial(reference.structural_similarity, **{**ssim.PLUGIN.parameters, **other})
+    assert not same_ssim(wrong, images)
+
+
+def test_equal_images() -> None:
+    image = np.random.default_rng(0).random((16, 16, 3)).astype(np.float32)
+    assert psnr.PLUGIN()(image, image) is None
+    assert mse.PLUGIN()(image, image) == 0 == mae.PLUGIN()(image, image)
+    assert ssim.PLUGIN()(image, image) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_arithmetic_is_float64() -> None:
+    """A difference of 2^-12 in one of 3·2^20 values would be lost in float32's mean of squares."""
+    truth = np.zeros((1024, 1024, 3), dtype=np.float32)
+    estimate = truth.copy()
+    estimate[0, 0, 0], estimate[-1, -1, -1] = 1.0, 2.0**-12
+    assert mse.PLUGIN()(truth, estimate) == (1 + 2.0**-24) / truth.size
+
+
+# ---- descriptors
+
+
+@pytest.mark.parametrize("degrees", [0.0, 1e-7, 1e-3, 45.0, 90.0, 179.999, 180.0])
+def test_angle_is_exact_at_both_ends(degrees: float) -> None:
+    theta = math.radians(degrees)
+    truth = np.array([[1.0, 0.0, 0.0]] * 3)
+    estimate = np.array([[math.cos(theta), math.sin(theta), 0.0]] * 3)
+    assert angle.PLUGIN()(truth, estimate) == pytest.approx(degrees, rel=1e-9, abs=1e-12)
+
+
+def test_control_arccos_of_the_dot_product_is_not_exact() -> None:
+    theta = math.radians(1e-7)
+    assert math.degrees(math.acos(math.cos(theta))) != pytest.approx(1e-7, rel=1e-3)
+
+
+def test_angle_is_a_mean_and_knows_zero_rows() -> None:
+    truth = np.array([[1, 0], [1, 0], [0, 1]], dtype=np.float32)
+    estimate = np.array([[1, 0], [0, 1], [0, 0]], dtype=np.float32)
+    assert angle.PLUGIN()(truth, estimate) == pytest.approx((0 + 90 + 90) / 3)
+
+
+def test_l2_is_the_mean_of_distances() -> None:
+    truth = np.array([[1, 0], [1, 0], [0, 1]], dtype=np.float32)
+    estimate = np.array([[-1, 0], [0, 1], [0, 1]], dtype=np.float32)
+    assert l2.PLUGIN()(truth, estimate) == pytest.approx((2 + math.sqrt(2) + 0) / 3, abs=1e-12)
+
+
+def test_recovered_counts_those_nearest_to_their_own() -> None:
+    truth = np.eye(4, dtype=np.float32)
+    estimate = unit(np.array([[0.6, 0.5, 0, 0], [0.6, 0.5, 0, 0], [0, 0, 1, 0], [0, 0, 0, -1]]))
+    # 0 and 2 are nearest to their own; 1 is nearest to 0; 3 ties with cosine 0 between 0, 1 and 2.
+    assert recovered.PLUGIN()(truth, estimate) == 0.5
+    assert recovered.PLUGIN()(truth, truth) == 1.0
+
+
+def test_recovered_ties_go_to_the_lowest_index() -> None:
+    truth = np.eye(3, dtype=np.float32)
+    nothing = np.zeros_like(truth)
+    assert recovered.PLUGIN()(truth, nothing) == pytest.approx(1 / 3)
+
+
+def test_recovered_takes_equal_descriptors_for_one_candidate() -> None:
+    truth = np.eye(3, dtype=np.float32)[[0, 0, 1]]
+    assert recovered.PLUGIN()(truth, truth) == 1.0
+
+
+def test_recovered_chance_level() -> None:
+    """Any one guess for all gives exactly 1 / N; independent guesses give it on average."""
+    rng = np.random.default_rng(0)
+    truth = unit(rng.normal(size=(200, 16)))
+    same = np.repeat(unit(rng.normal(size=(1, 16))), 200, axis=0)
+    assert recovered.PLUGIN()(truth, same) == pytest.approx(1 / 200)
+    hits = sum(round(200 * recovered.PLUGIN()(truth, unit(rng.normal(size=(200, 16))))) for _ in range(50))
+    assert 20 <= hits <= 85  # 50 are expected; about Poisson, so within 5 deviations
+
+
+# ---- what all have in common
+
+
+@pytest.mark.parametrize("plugin", IMAGES + DESCRIPTORS)
+def test_declarations(plugin: type[Metric]) -> None:
+    assert plugin.compares == ("images" if plugin in IMAGES else "descriptors")
+    assert plugin.unit
+    assert plugin.range[0] < plugin.range[1]
+    errors = {mae.PLUGIN, mse.PLUGIN, angle.PLUGIN, l2.PLUGIN}
+    assert plugin.higher_is_better_for == ("defender" if plugin in errors else "attacker")
+    assert plugin.summary()
+
+
+@pytest.mark.parametrize("plugin", IMAGES + DESCRIPTORS)
+def test_values_are_in_range_and_pure(plugin: type[Metric]) -> None:
+    rng = np.random.default_rng(0)
+    shape = (16, 16, 3) if plugin in IMAGES else (20, 8)
+    for _ in range(10):
+        truth, estimate = rng.random(shape).astype(np.float32), rng.random(shape).astype(np.float32)
+        if plugin in DESCRIPTORS:
+            truth, estimate = unit(truth - 0.5), unit(estimate - 0.5)
+        before = truth.copy(), estimate.copy()
+        value = plugin()(truth, estimate)
+        assert isinstance(value, float)
+        assert plugin.range[0] <= value <= plugin.range[1]
+        np.testing.assert_array_equal(truth, before[0])
+        np.testing.assert_array_equal(estimate, before[1])
+
+
+@pytest.mark.parametrize("plugin", IMAGES)
+def test_bad_images_are_refused(plugin: type[Metric]) -> None:
+    good = np.full((16, 16, 3), 0.5, dtype=np.float32)
+    nan, bright = good.copy(), good * 255
+    nan[3, 4, 1] = np.nan
+    with pytest.raises(ValueError, match="differ in shape"):
+        plugin()(good, good[:12])
+    with pytest.raises(ValueError, match=r"must be \(H, W, 3\)"):
+        plugin()(good[..., 0], good[..., 0])
+    for wrong in (nan, bright, -good):
+        with pytest.raises(ValueError, match=r"estimate: values must be in \[0, 1\]"):
+            plugin()(good, wrong)
+        with pytest.raises(ValueError, match=r"truth: values must be in \[0, 1\]"):
+            plugin()(wrong, good)
+
+
+@pytest.mark.parametrize("plugin", DESCRIPTORS)
+def test_bad_descriptors_are_refused(plugin: type[Metric]) -> None:
+    good = np.eye(4, dtype=np.float32)
+    nan = good.copy()
+    nan[1, 1] = np.nan
+    with pytest.raises(ValueError, match="differ in shape"):
+        plugin()(good, good[:3])
+    with pytest.raises(ValueError, match="at least 1"):
+        plugin()(good[:0], good[:0])
+    with pytest.raises(ValueError, match="estimate: descriptors must be finite"):
+        plugin()(good, nan)
+    with pytest.raises(ValueError, match="truth: descriptors must be finite"):
+        plugin()(nan, good)

@@ -1,0 +1,118 @@
+"""Records: what is written is read, and what a crash leaves is mended."""
+
+import json
+import logging
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import bench
+from bench import records
+from bench.errors import UserError
+from bench.records import Log, read
+
+
+def record(unit: str, **more: Any) -> dict[str, Any]:
+    return {"schema": 1, "run_hash": "r", "cell_id": "c", "unit": unit, "status": "ok", "metrics": {"ssim": 0.1 + 0.2}, **more}
+
+
+def write(path: Path, *found: dict[str, Any]) -> Path:
+    with Log(path) as log:
+        for one in found:
+            log.append(one)
+    return path
+
+
+def test_what_is_written_is_read_in_full_precision(tmp_path: Path) -> None:
+    path = write(tmp_path / "deep" / "records.jsonl", record("a"), record("b"))
+    assert read(path).records == [record("a"), record("b")]
+    assert read(path).records[0]["metrics"]["ssim"] == 0.1 + 0.2
+    assert read(path).notice is None
+
+
+def test_records_are_on_file_as_soon_as_they_are_appended(tmp_path: Path) -> None:
+    with Log(tmp_path / "r") as log:
+        log.append(record("a"))
+        assert len(read(tmp_path / "r").records) == 1
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_no_record_holds_nan_or_infinity(tmp_path: Path, value: float) -> None:
+    with Log(tmp_path / "r") as log, pytest.raises(ValueError, match="JSON compliant"):
+        log.append(record("a", seconds=value))
+    assert (tmp_path / "r").read_bytes() == b""
+
+
+@pytest.mark.parametrize("cut", [1, 5, 40])
+def test_line_that_a_crash_cut_off_is_dropped_and_mended(tmp_path: Path, cut: int) -> None:
+    path = write(tmp_path / "r", record("a"), record("b"))
+    path.write_bytes(path.read_bytes()[:-cut])
+    assert [one["unit"] for one in read(path).records] == ["a"]
+    assert "cut off" in (read(path).notice or "")
+    write(path, record("c"))
+    assert [one["unit"] for one in read(path).records] == ["a", "c"]
+    assert read(path).notice is None
+
+
+@pytest.mark.parametrize("line", [b"{nonsense", b"[]", b'{"schema": 99}', b"\xff\xfe"])
+def test_other_corrupt_lines_are_named(tmp_path: Path, line: bytes) -> None:
+    path = write(tmp_path / "r", record("a"))
+    path.write_bytes(path.read_bytes() + line + b"\n" + json.dumps(record("b")).encode() + b"\n")
+    with pytest.raises(UserError, match="r, line 2: "):
+        read(path)
+    before = path.read_bytes()
+    with pytest.raises(UserError, match="line 2"):
+        Log(path)
+    assert path.read_bytes() == before
+
+
+def test_file_that_cannot_be_written_is_a_mistake(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match="cannot write"):
+        Log(tmp_path / "file" / "records.jsonl")
+
+
+def test_full_disk_keeps_what_was_written() -> None:
+    full = Path("/dev/full")
+    if not full.exists():
+        pytest.skip("this system has no /dev/full")
+    log = Log.__new__(Log)
+    log._file = full.open("ab", buffering=0)
+    with pytest.raises(OSError, match="No space left"):
+        log.append(record("a"))
+
+
+def test_dataframe_has_flat_columns_and_the_latest_records(tmp_path: Path) -> None:
+    old = record("a", status="failed", defense={"name": "ldp", "epsilon": "inf"})
+    new = record("a", defense={"name": "ldp", "epsilon": "inf"})
+    write(tmp_path / "records.jsonl", old, record("b", metrics={"psnr": None}), new)
+    frame = bench.load_records(tmp_path)
+    assert len(frame) == 2
+    assert list(frame.set_index("unit")["status"]) == ["ok", "ok"]
+    assert frame.set_index("unit").loc["a", "defense.epsilon"] == math.inf
+    assert frame.set_index("unit").loc["a", "metrics.ssim"] == 0.1 + 0.2
+
+
+def test_dataframe_of_nothing(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="no such file"):
+        bench.load_records(tmp_path / "absent")
+    assert bench.load_records(write(tmp_path / "records.jsonl")).empty
+
+
+def test_reader_is_told_of_a_lost_line(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = write(tmp_path / "records.jsonl", record("a"))
+    path.write_bytes(path.read_bytes() + b'{"sch')
+    with caplog.at_level(logging.WARNING):
+        assert len(bench.load_records(path)) == 1
+    assert "cut off" in caplog.text
+
+
+def test_cell_does_not_depend_on_the_name_of_the_folder_or_the_order_of_keys() -> None:
+    def cell(**dataset: Any) -> str:
+        return records.cell_id("t", {"name": "ldp", "epsilon": 1.0}, None, dataset, 0, {})
+
+    assert cell(name="a", hash="1") == cell(hash="1", name="b")
+    assert cell(hash="1") != cell(hash="2")
+    assert records.run_hash("a", {"torch": "1"}) != records.run_hash("a", {"torch": "2"})

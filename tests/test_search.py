@@ -1,0 +1,87 @@
+"""The exact search for the nearest word, against brute force in float64 and against faiss."""
+
+import faiss
+import numpy as np
+import pytest
+import torch
+
+from bench.kernels import search
+from bench.kernels.search import WordIndex, unit_rows
+
+
+def nearest_rows(queries: np.ndarray, words: np.ndarray) -> np.ndarray:
+    return WordIndex(words).nearest(queries)
+
+
+def brute_force(queries: np.ndarray, words: np.ndarray) -> np.ndarray:
+    rows = words.astype(np.float64)
+    return (queries.astype(np.float64) @ (rows / np.linalg.norm(rows, axis=1, keepdims=True)).T).argmax(axis=1)
+
+
+@pytest.fixture
+def words(rng):
+    return rng.integers(0, 200, (5000, 128), dtype=np.uint8)
+
+
+def test_agrees_with_brute_force(rng, words):
+    queries = rng.integers(0, 200, (700, 128), dtype=np.uint8)
+    assert np.array_equal(nearest_rows(queries, words), brute_force(queries, words))
+
+
+def test_agrees_with_faiss_on_floats(rng, words):
+    queries = np.abs(rng.normal(size=(300, 128))).astype(np.float32)
+    index = faiss.IndexFlatIP(128)
+    index.add(unit_rows(words))
+    assert (nearest_rows(queries, words) == index.search(unit_rows(queries), 1)[1][:, 0]).mean() > 0.99  # float32's ties aside
+
+
+def test_words_that_bf16_cannot_tell_apart(rng):
+    """Words that differ by one step in one component: only an exact comparison finds the right one."""
+    base = rng.integers(100, 156, 128, dtype=np.uint8)
+    words = np.repeat(base[None], 4096, axis=0)
+    words[np.arange(4096), rng.integers(128, size=4096)] += rng.integers(1, 3, 4096, dtype=np.uint8)
+    queries = words[rng.integers(4096, size=200)]
+    assert np.array_equal(nearest_rows(queries, words), brute_force(queries, words))
+
+
+def test_without_a_margin_it_would_be_wrong(rng, monkeypatch):
+    """Negative control of the tests above: the first pass alone does not decide."""
+    base = rng.integers(60, 200, 128)
+    words = (base + rng.integers(-25, 26, (3 * search.BLOCK, 128))).astype(np.uint8)  # cosines of .98, a few bf16 steps apart
+    queries = (base + rng.integers(-25, 26, (700, 128))).astype(np.uint8)
+    assert np.array_equal(nearest_rows(queries, words), brute_force(queries, words))
+    monkeypatch.setattr(search, "MARGIN", dict.fromkeys(search.MARGIN, 0.0))
+    monkeypatch.setattr(search, "pick_dtype", lambda device: torch.bfloat16)
+    assert not np.array_equal(nearest_rows(queries, words), brute_force(queries, words))
+
+
+def test_ties_go_to_the_lowest_index(words):
+    doubled = np.concatenate([words, words])  # each word stands twice, in different blocks
+    found = nearest_rows(words[:300], doubled)
+    assert (found < len(words)).all()
+
+
+def test_a_longer_multiple_is_the_same_direction():
+    words = np.zeros((3, 128), dtype=np.uint8)
+    words[0, 0], words[1, 1], words[2, 0] = 10, 10, 250
+    query = np.zeros((1, 128), dtype=np.float32)
+    query[0, 0] = 3.5
+    assert nearest_rows(query, words)[0] == 0
+
+
+def test_no_queries(words):
+    assert nearest_rows(np.empty((0, 128), np.uint8), words).shape == (0,)
+
+
+@pytest.mark.benchmark
+def test_speed_of_nearest_rows(benchmark, rng):
+    words = rng.integers(0, 200, (65_536, 128), dtype=np.uint8)
+    queries = rng.integers(0, 200, (700, 128), dtype=np.uint8)
+    benchmark(WordIndex(words).nearest, queries)
+
+
+@pytest.mark.benchmark
+def test_speed_of_faiss_flat(benchmark, rng):
+    index = faiss.IndexFlatIP(128)
+    index.add(unit_rows(rng.integers(0, 200, (65_536, 128), dtype=np.uint8)))
+    benchmark(index.search, unit_rows(rng.integers(0, 200, (700, 128), dtype=np.uint8)), 1)

@@ -1,0 +1,136 @@
+"""Tables and figures that are made from records."""
+
+import io
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from rich.console import Console
+
+from leaderboard import figures, tables
+
+SIFT = {"name": "sift", "upright": True}
+
+
+def record(unit: str = "a", **more: Any) -> dict[str, Any]:
+    return {
+        "schema": 1,
+        "cell_id": "c",
+        "run_hash": "r",
+        "task": "reconstruction",
+        "defense": {"name": "ldp", "epsilon": 10.0, "dictionary": "sha256:0123456789"},
+        "attack": {"name": "dia", "weights": "sha256:ab"},
+        "dataset": {"name": "photos", "hash": "sha256:0", "extractor": SIFT},
+        "seed": 0,
+        "unit": unit,
+        "status": "ok",
+        "reason": None,
+        "metrics": {"mae": 0.1, "psnr": 20.0, "ssim": 0.5, "angle": None, "keypoints": 100},
+        "privacy": {"guarantee": "epsilon-ldp", "epsilon_descriptor": 10.0, "epsilon_image": 1000.0, "log10_true": -0.8},
+        "notes": [],
+    } | more
+
+
+NA = record("*", run_hash="n", attack={"name": "nearest"}, status="n/a", reason="nearest attacks Subspaces", metrics={})
+
+
+def test_metrics_are_averaged_over_photographs() -> None:
+    metrics = {"mae": 0.3, "psnr": None, "ssim": 0.7, "keypoints": 300}
+    other = record("b", metrics=metrics, privacy=record()["privacy"] | {"epsilon_image": 3000.0})
+    (table,) = tables.tables([record(), other])
+    row = table.frame.iloc[0]
+    assert row["photographs"] == 2
+    assert row["mae"] == pytest.approx(0.2)
+    assert row["psnr"] == 20.0  # of the photographs that have one
+    assert row["epsilon_image"] == 2000.0
+    assert table.metrics == ("keypoints", "mae", "ssim", "psnr")  # nothing has an angle
+
+
+def test_heading_states_what_was_measured() -> None:
+    (table,) = tables.tables([record()])
+    assert table.heading == "Reconstruction on photos (1 photograph), sift upright features, seed 0"
+    oriented = record(run_hash="o", dataset={"name": "photos", "extractor": {"name": "sift", "upright": False}})
+    assert [table.heading.count("oriented") for table in tables.tables([record(), oriented])] == [0, 1]
+    assert "not private" in tables.to_markdown(table)
+
+
+def test_what_does_not_apply_is_neither_blank_nor_zero() -> None:
+    (table,) = tables.tables([record(), NA])
+    shown = tables.rendered(table)
+    assert list(shown.loc[1, ["n", "MAE", "SSIM", "PSNR"]]) == ["n/a"] * 4
+    assert shown.loc[1, "note"] == "nearest attacks Subspaces"
+    csv = pd.read_csv(io.StringIO(tables.to_csv([table])), keep_default_na=False)
+    assert csv.loc[1, "ssim"] == "n/a"
+    assert csv.loc[1, "photographs"] == "n/a"
+    assert csv.loc[0, "ssim"] == "0.5"
+
+
+def test_failures_are_counted_and_told() -> None:
+    failed = record("b", status="failed", reason="b.jpg: truncated", metrics={})
+    (table,) = tables.tables([record(), failed])
+    assert (table.frame.loc[0, "photographs"], table.frame.loc[0, "failed"]) == (1, 1)
+    assert "failed: b, ldp:epsilon=10, dia: b.jpg: truncated" in tables.to_markdown(table)
+    (all_failed,) = tables.tables([failed])
+    assert all_failed.frame.loc[0, "note"] == "no photograph could be done"
+
+
+def test_later_record_of_a_unit_replaces_the_earlier() -> None:
+    failed = record(status="failed", reason="x", metrics={})
+    (table,) = tables.tables([failed, record()])
+    assert (table.frame.loc[0, "photographs"], table.frame.loc[0, "failed"]) == (1, 0)
+
+
+def test_labels_show_digests_only_where_they_tell_apart() -> None:
+    one, other = record(), record(defense=record()["defense"] | {"dictionary": "sha256:fedcba9876"}, run_hash="o")
+    (table,) = tables.tables([one, other])
+    assert list(table.frame["defense"]) == ["ldp:epsilon=10,dictionary=01234567", "ldp:epsilon=10,dictionary=fedcba98"]
+    (table,) = tables.tables([one, NA])
+    assert list(table.frame["defense"]) == ["ldp:epsilon=10"] * 2
+
+
+@pytest.mark.parametrize(
+    ("log10", "shown"), [(-0.8332, "0.1468"), (0.0, "1"), (-612.25, "10^-612.2"), (math.nan, "n/a"), (None, "n/a")]
+)
+def test_chances_too_small_for_a_float_are_shown(log10: float | None, shown: str) -> None:
+    (table,) = tables.tables([record(privacy=record()["privacy"] | {"log10_true": log10})])
+    assert tables.rendered(table).loc[0, "Pr(true)"] == shown
+
+
+def test_infinite_epsilon_is_shown() -> None:
+    privacy = record()["privacy"] | {"epsilon_descriptor": "inf", "epsilon_image": "inf"}
+    (table,) = tables.tables([record(privacy=privacy)])
+    assert tables.rendered(table).loc[0, "ε/descriptor"] == "∞"
+    assert tables.rendered(table).loc[0, "ε/image"] == "∞"
+
+
+def test_terminal_and_markdown_show_the_same_cells() -> None:
+    (table,) = tables.tables([record(), NA])
+    console = Console(file=io.StringIO(), width=300)
+    console.print(tables.to_rich(table))
+    drawn = console.file.getvalue()  # type: ignore[attr-defined]
+    for cell in tables.rendered(table).to_numpy().ravel():
+        assert cell in drawn
+        assert cell in tables.to_markdown(table)
+
+
+def test_pipe_in_a_reason_does_not_break_markdown() -> None:
+    (table,) = tables.tables([NA | {"reason": "a|b\nc"}])
+    assert r"a\|b c" in tables.to_markdown(table)
+
+
+def test_figure_has_a_panel_for_each_record(tmp_path: Path) -> None:
+    from PIL import Image
+
+    kept = tmp_path / "kept.png"
+    Image.fromarray(np.zeros((256, 256, 3), np.uint8)).save(kept)
+    failed = record(status="failed", reason="too $dark$ " * 20, run_hash="f", metrics={})
+    shown = figures.panels(np.zeros((256, 256, 3), np.uint8), [record(), failed], [kept, tmp_path / "absent"])
+    assert [panel.title for panel in shown] == ["original", "ldp:epsilon=10\ndia", "ldp:epsilon=10\ndia"]
+    assert [panel.beneath[:10] for panel in shown] == ["", "SSIM 0.500", "failed: to"]
+    assert shown[2].pixels is None
+    for panels in (shown, shown * 3):
+        figures.draw(panels, "a").savefig(tmp_path / "figure.png")
+        assert (tmp_path / "figure.png").stat().st_size > 1000
