@@ -46,9 +46,10 @@ def test_words_that_bf16_cannot_tell_apart(rng):
 
 def test_without_a_margin_it_would_be_wrong(rng, monkeypatch):
     """Negative control of the tests above: the first pass alone does not decide."""
-    base = rng.integers(60, 200, 128)
-    words = (base + rng.integers(-25, 26, (3 * search.BLOCK, 128))).astype(np.uint8)  # cosines of .98, a few bf16 steps apart
-    queries = (base + rng.integers(-25, 26, (700, 128))).astype(np.uint8)
+    base = rng.integers(0, 120, 128)
+    words, queries = (
+        np.clip(base + rng.integers(-60, 61, (count, 128)), 0, 255).astype(np.uint8) for count in (3 * search.BLOCK, 4000)
+    )
     assert np.array_equal(nearest_rows(queries, words), brute_force(queries, words))
     monkeypatch.setattr(search, "MARGIN", dict.fromkeys(search.MARGIN, 0.0))
     monkeypatch.setattr(search, "pick_dtype", lambda device: torch.bfloat16)
