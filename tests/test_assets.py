@@ -73,7 +73,7 @@ def ssim_by_defense(images):
     assert {record["status"] for record in records} == {"ok"}
     frame = pd.json_normalize(records)
     frame["epsilon"] = frame.get("defense.epsilon")
-    return frame.pivot_table(index="unit", columns=frame["epsilon"].fillna("raw"), values="metrics.ssim")
+    return frame.pivot_table(index="unit", columns=frame["epsilon"].astype(object).fillna("raw"), values="metrics.ssim")
 
 
 def assert_ordered(table: pd.DataFrame) -> None:
