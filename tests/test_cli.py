@@ -45,22 +45,9 @@ def images(tmp_path: Path) -> Path:
 def test_run_writes_everything_and_prints_the_table(bench: Bench, images: Path, tmp_path: Path) -> None:
     ldp = f"ldp:epsilon=12,dictionary={small_dictionary(tmp_path)}"
     out = tmp_path / "x"
-    status, shown, told = bench(
-        "run",
-        "--defense",
-        ldp,
-        "--defense",
-        "none",
-        "--attack",
-        "painter",
-        "--attack",
-        "guess",
-        "--images",
-        images,
-        "--out",
-        out,
-        *PAINT,
-    )
+    defenses, attacks = ("--defense", ldp, "--defense", "none"), ("--attack", "painter", "--attack", "guess")
+    command = ("run", *defenses, *attacks, "--images", images, "--out", out, *PAINT)
+    status, shown, told = bench(*command)
     assert status == 0
     assert "ldp:epsilon=12,subset_size=2" in shown
     assert "n/a" in shown
@@ -71,22 +58,7 @@ def test_run_writes_everything_and_prints_the_table(bench: Bench, images: Path, 
     assert {path.name for path in (out / "figures").iterdir()} == {"0.png.png", "1.png.png"}
     assert "sift upright" in (out / "report.md").read_text()
     before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
-    again = bench(
-        "run",
-        "--defense",
-        ldp,
-        "--defense",
-        "none",
-        "--attack",
-        "painter",
-        "--attack",
-        "guess",
-        "--images",
-        images,
-        "--out",
-        out,
-        *PAINT,
-    )
+    again = bench(*command)
     assert again[:2] == (0, shown)
     assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
 
