@@ -40,7 +40,7 @@ class DIA(ImageAttack):
     def reconstruct(self, view: View, rng: np.random.Generator) -> Floats:
         network = self._network(view.defense, view.extractor, view.know(Knowledge.TRAINING_IMAGES))
         known = condition(view.defense, network.served)
-        points = encode([view.release], [known], network.meta["slots"])
+        points = encode([view.release], [known], network.meta["slots"], network.meta["encoding"])
         painted = paint(network.module, points)  # (1, 3, H, W)
         return painted[0].permute(1, 2, 0).cpu().numpy()
 

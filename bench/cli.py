@@ -157,6 +157,13 @@ def _parser() -> argparse.ArgumentParser:
         metavar="FILE",
         help="a dictionary that quantises photographs which the defense's own was made from; may be repeated",
     )
+    train.add_argument(
+        "--encoding",
+        choices=("invariant", "released", "positions"),
+        default="invariant",
+        help="what the network is told: the release without random order or basis, as it is, or positions alone",
+    )
+    train.add_argument("--widths", type=_wholes, metavar="N,N,...", help="channels of the network's levels")
     train.add_argument("--start", type=Path, metavar="FILE", help="weights of a network for raw descriptors to start from")
     train.add_argument("--rate", type=float, metavar="R", help="the learning rate at its peak")
     train.add_argument("--steps", type=_whole, metavar="N", help="steps of training")
@@ -225,6 +232,7 @@ def _build_dictionary(args: argparse.Namespace) -> int:
 
 
 def _train(args: argparse.Namespace) -> int:
+    from attacks.inversion.network import Shape
     from attacks.inversion.train import Training, train
     from bench import registry, spec
     from bench.datasets.photographs import folder, held_out
@@ -242,6 +250,8 @@ def _train(args: argparse.Namespace) -> int:
         extractor=spec.read(args.extractor, registry.EXTRACTOR),
         crossfit=[Asset(file) for file in args.crossfit],
         start=args.start,
+        encoding=args.encoding,
+        widths=args.widths or Shape.widths,
         training=Training(**chosen),
     )
     scores = ", ".join(f"{name} {value:.4g}" for name, value in meta["validation"].items())
@@ -291,6 +301,10 @@ def _whole(text: str) -> int:
         return int(text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"expected a whole number, not {text!r}") from None
+
+
+def _wholes(text: str) -> tuple[int, ...]:
+    return tuple(_whole(part) for part in text.split(","))
 
 
 def _say(status: int, line: str) -> int:

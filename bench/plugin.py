@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, final
 
@@ -82,8 +82,10 @@ class Defense(Plugin, ABC):
     releases: ClassVar[type[Release]]
     # The settings that one trained attacker serves. A network trained for this plugin sees them drawn at random.
     serves: ClassVar[Mapping[str, Between | OneOf]] = {}
-    # The field that names the dictionary by which descriptors are quantised, if they are.
+    # The field that names the dictionary by which descriptors are quantised, if they are, and the field that says how many of
+    # its words are used.
     quantised_by: ClassVar[str | None] = None
+    truncated_by: ClassVar[str | None] = None
 
     @abstractmethod
     def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> Release:
@@ -121,6 +123,10 @@ class Attack(Plugin, ABC):
 
     accepts: ClassVar[tuple[type[Release], ...]]
     needs: ClassVar[frozenset[Knowledge]] = frozenset()
+
+    def repeats(self) -> int:
+        """Further releases of the same photograph that this attack, as configured, sees: those of REPEATED_RELEASES."""
+        return 0
 
     def unsuited(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
         """Why this attack, as configured, has nothing adapted to that defense; None if it has."""
@@ -199,6 +205,8 @@ class Trial:
     public: Public
     metrics: tuple[Metric, ...]
     rng: np.random.Generator
+    others: Callable[[int], Iterator[Release]]  # the first so many releases of other photographs
+    repeats: tuple[Release, ...]  # further releases of the same features
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

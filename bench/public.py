@@ -31,31 +31,32 @@ class Public:
 
     def __init__(self, quantiser: Quantiser = lambda known, rows: known.index.nearest(rows), remembered: int = 64) -> None:
         self._quantiser = quantiser
-        self._dictionaries: dict[str, Dictionary] = {}
+        self._dictionaries: dict[tuple[str, int], Dictionary] = {}
         self._quantised: OrderedDict[str, Indices] = OrderedDict()
         self._remembered = remembered
 
-    def dictionary(self, asset: str) -> Dictionary:
-        """The dictionary called `shipped` or `shipped-public`, or that of a file.
+    def dictionary(self, asset: str, words: int = 0) -> Dictionary:
+        """The first `words` words, all if 0, of the dictionary called `shipped` or `shipped-public`, or of that of a file.
 
         Raises
         ------
         UserError
             if it is missing or damaged.
         """
-        if asset not in self._dictionaries:
-            self._dictionaries[asset] = dictionary.load(dictionary_path(asset))
-        return self._dictionaries[asset]
+        if (asset, words) not in self._dictionaries:
+            known = self.dictionary(asset).first(words) if words else dictionary.load(dictionary_path(asset))
+            self._dictionaries[asset, words] = known
+        return self._dictionaries[asset, words]
 
-    def nearest_words(self, asset: str, features: Features) -> Indices:
-        """For each descriptor the word of greatest cosine, ties to the lowest index. -> (N,) int64, a copy
+    def nearest_words(self, asset: str, features: Features, words: int = 0) -> Indices:
+        """For each descriptor the word of greatest cosine among the first `words`, ties to the lowest. -> (N,) int64, a copy
 
         Raises
         ------
         UserError
             if the descriptors are not as long as the words.
         """
-        known = self.dictionary(asset)
+        known = self.dictionary(asset, words)
         queries = features.descriptors if features.codes is None else features.codes
         if queries.shape[1] != known.words.shape[1]:
             raise UserError(f"the descriptors have length {queries.shape[1]}, the words of {asset} {known.words.shape[1]}")
@@ -63,11 +64,11 @@ class Public:
         if key in self._quantised:
             self._quantised.move_to_end(key)
             return self._quantised[key].copy()
-        words = self._quantiser(known, queries)
-        self._quantised[key] = words
+        nearest = self._quantiser(known, queries)
+        self._quantised[key] = nearest
         while len(self._quantised) > self._remembered:
             self._quantised.popitem(last=False)
-        return words.copy()
+        return nearest.copy()
 
     def forget(self) -> None:
         """Drop every cache."""

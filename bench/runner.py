@@ -7,13 +7,14 @@ order, or what was done before. So every attack sees the same release, and a res
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import itertools
 import logging
 import time
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from bench.datasets.photographs import Photograph, Source
 from bench.errors import PluginError, UnitError, UserError, blamed
 from bench.features.sift import Sift
 from bench.plugin import Attack, Defense, Extractor, Metric, Outcome, Privacy, Task, Trial
+from bench.population import Population
 from bench.public import Public
 from bench.records import EVERY_UNIT, Record
 from bench.tasks.reconstruction import Reconstruction
@@ -42,6 +44,7 @@ class Cell:
     defense: Defense
     attack: Attack | None
     privacy: Privacy
+    population: Population  # releases of the dataset's photographs by that defense
     head: Record  # what all its records begin with
     reason: str | None  # why it does not apply, if it does not
 
@@ -138,12 +141,15 @@ def prepare(
     cells = []
     for defense in defenses:
         promise = defense.privacy(public)
+        protected = spec.configuration(defense, public)
+        drawn = functools.partial(randomness, "population", seed, protected, dataset["extractor"])
+        population = Population(sources, extractor, defense, public, drawn)
         for attack in tried:
             reason = task.inapplicable(defense, attack, extractor, public)
             head = {
                 "schema": records.SCHEMA,
                 "task": task.name(),
-                "defense": spec.configuration(defense, public),
+                "defense": protected,
                 "attack": _attack_configuration(task, defense, attack, extractor, public, reason),
                 "dataset": dataset,
                 "metric_settings": settings,
@@ -151,7 +157,7 @@ def prepare(
             }
             cell_id = records.cell_id(spec.written(task), head["defense"], head["attack"], dataset, seed, settings)
             head |= {"cell_id": cell_id, "run_hash": records.run_hash(cell_id, ran), "environment": ran}
-            cells.append(Cell(defense, attack, promise, head, reason))
+            cells.append(Cell(defense, attack, promise, population, head, reason))
     if all(cell.reason for cell in cells):
         raise UserError("nothing to run: " + "; ".join(sorted({str(cell.reason) for cell in cells})))
     unique = {cell.head["cell_id"]: cell for cell in cells}  # one that was asked for twice is done once
@@ -238,12 +244,7 @@ def _rehearse(plan: Plan) -> None:
             features = _observe(plan, source)[1]
         except UnitError:
             continue
-        one = replace(
-            features,
-            keypoints=features.keypoints[:1],
-            descriptors=features.descriptors[:1],
-            codes=None if features.codes is None else features.codes[:1],
-        )
+        one = features.take(np.arange(1))
         for cell in plan.cells:
             with contextlib.suppress(UnitError):  # a broken plugin makes failed records, later
                 _protect(plan, cell, one, "rehearsal")
@@ -299,9 +300,9 @@ def _observe(plan: Plan, source: Source) -> tuple[Photograph, Features]:
     return photograph, features
 
 
-def _protect(plan: Plan, cell: Cell, features: Features, content: str) -> Release:
+def _protect(plan: Plan, cell: Cell, features: Features, content: str, *repetition: int) -> Release:
     head = cell.head
-    rng = randomness("release", plan.seed, content, head["defense"], head["dataset"]["extractor"])
+    rng = randomness("release", plan.seed, content, head["defense"], head["dataset"]["extractor"], *repetition)
     with blamed(f"plugin {cell.defense.name()}"):
         release = cell.defense.protect(features, plan.public, rng)
         if not isinstance(release, cell.defense.releases):
@@ -324,6 +325,8 @@ def _judged(
         public=plan.public,
         metrics=plan.metrics,
         rng=randomness("attack", plan.seed, content, head["defense"], head["dataset"]["extractor"], head["attack"]),
+        others=cell.population.without(source.name),
+        repeats=tuple(_protect(plan, cell, features, content, number) for number in _repetitions(cell.attack)),
     )
     started = time.perf_counter()
     with blamed(f"task {plan.task.name()}"):
@@ -333,6 +336,11 @@ def _judged(
     if out is not None and outcome.image is not None:
         _save_picture(picture(out, record), outcome.image)
     return record
+
+
+def _repetitions(attack: Attack | None) -> range:
+    """The numbers of the further releases that an attack sees. The first release has none."""
+    return range(1, 1 + (0 if attack is None else attack.repeats()))
 
 
 def _failed(cells: Sequence[Cell], source: Source, error: Exception, out: Path | None) -> Iterator[Record]:

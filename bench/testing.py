@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ import numpy as np
 from bench.datasets.photographs import SIDE
 from bench.features import dictionary
 from bench.kernels.search import unit_rows
-from bench.plugin import Asset, Attack, Defense, DescriptorAttack, Extractor, ImageAttack, Metric
+from bench.plugin import Asset, Attack, Defense, DescriptorAttack, Extractor, ImageAttack, Metric, Trial
 from bench.public import Public
 from bench.tasks.reconstruction import Reconstruction, view
 from bench.types import Descriptors, Features, Floats, Indices, Release, Subspaces, WordSets
@@ -85,8 +86,25 @@ def check_attack(attack: Attack, defense: Defense, extractor: Extractor, secret:
 
     public = Public(quantise)
     mine = copy.deepcopy(secret)
-    release = defense.protect(mine, public, np.random.default_rng(1))
-    first = _estimate(attack, defense, release, extractor, public)
+    strangers = [example_features(len(secret), seed) for seed in range(5, 8)]
+
+    def others(count: int) -> Iterator[Release]:
+        return (defense.protect(features, Public(), np.random.default_rng(4)) for features in strangers[:count])
+
+    trial = Trial(
+        pixels=np.zeros((*secret.size[::-1], 3), np.uint8),
+        secret=mine,
+        release=defense.protect(mine, public, np.random.default_rng(1)),
+        defense=defense,
+        attack=attack,
+        extractor=extractor,
+        public=public,
+        metrics=(),
+        rng=np.random.default_rng(3),
+        others=others,
+        repeats=tuple(defense.protect(mine, public, np.random.default_rng([2, number])) for number in range(attack.repeats())),
+    )
+    first = _estimate(trial)
     if isinstance(attack, DescriptorAttack):
         assert first.shape == secret.descriptors.shape
         np.testing.assert_allclose(np.linalg.norm(first, axis=1), 1, atol=TOLERANCE)
@@ -98,7 +116,7 @@ def check_attack(attack: Attack, defense: Defense, extractor: Extractor, secret:
     for array in (*_arrays(mine), *cached):
         array[...] = 0
     public.forget()
-    assert np.array_equal(first, _estimate(attack, defense, release, extractor, public)), "the attack saw more than the release"
+    assert np.array_equal(first, _estimate(trial)), "the attack saw more than the release"
 
 
 def check_metric(metric: Metric, seed: int = 0) -> None:
@@ -148,13 +166,12 @@ def same_array(one: np.ndarray, other: np.ndarray) -> bool:
     return one.dtype == other.dtype and np.array_equal(one, other)
 
 
-def _estimate(attack: Attack, defense: Defense, release: Release, extractor: Extractor, public: Public) -> Floats:
-    seen = view(attack, defense, release, extractor, public)
-    rng = np.random.default_rng(3)
-    if isinstance(attack, DescriptorAttack):
-        return attack.recover(seen, rng)
-    assert isinstance(attack, ImageAttack)
-    return attack.reconstruct(seen, rng)
+def _estimate(trial: Trial) -> Floats:
+    seen, rng = view(trial), np.random.default_rng(3)
+    if isinstance(trial.attack, DescriptorAttack):
+        return trial.attack.recover(seen, rng)
+    assert isinstance(trial.attack, ImageAttack)
+    return trial.attack.reconstruct(seen, rng)
 
 
 def _arrays(value: Any) -> list[np.ndarray]:

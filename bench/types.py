@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,7 @@ class Features:
     descriptors: Floats  # (N, D) unit norm
     codes: Bytes | None  # (N, D) the 8-bit vectors that the descriptors came from, where there are any
     size: tuple[int, int]  # width, height in pixels
+    frames: Floats | None = None  # (N, 2) scale in pixels and orientation in radians, where the extractor tells them
 
     def __len__(self) -> int:
         return len(self.keypoints)
@@ -33,12 +35,16 @@ class Features:
 
         Extractors find strong keypoints first, and strength is not released: in their order it would be.
         """
-        order = np.lexsort((self.keypoints[:, 0], self.keypoints[:, 1]))
+        return self.take(np.lexsort((self.keypoints[:, 0], self.keypoints[:, 1])))
+
+    def take(self, rows: NDArray[Any]) -> Features:
+        """The features of some keypoints, in the order of `rows`: indices, or a mask."""
         return Features(
-            keypoints=self.keypoints[order],
-            descriptors=self.descriptors[order],
-            codes=None if self.codes is None else self.codes[order],
+            keypoints=self.keypoints[rows],
+            descriptors=self.descriptors[rows],
+            codes=None if self.codes is None else self.codes[rows],
             size=self.size,
+            frames=None if self.frames is None else self.frames[rows],
         )
 
 
@@ -55,9 +61,10 @@ class Release:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Descriptors(Release):
-    """One descriptor a keypoint."""
+    """One descriptor a keypoint, and what else of it is sent."""
 
     descriptors: Floats  # (N, D)
+    frames: Floats | None = None  # (N, 1) scale in pixels, or (N, 2) with orientation in radians, where they are sent
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -90,5 +97,6 @@ class Knowledge(Enum):
     DATABASE = "the database W that lifting drew its adversarial descriptors from"
     PUBLIC_DATABASE = "a database Z of the attacker's own, from other photographs"
     OTHER_RELEASES = "other releases made with the same database"
+    REPEATED_RELEASES = "further releases of the same photograph"
     MAP = "the server's map"
     TRAINING_IMAGES = "photographs to train an inversion network on"

@@ -26,22 +26,30 @@ class LDP(Defense):
     """
 
     releases = WordSets
-    serves: ClassVar[Mapping[str, Between | OneOf]] = {"epsilon": Between(8.0, 16.0), "subset_size": OneOf((1, 2, 3, 4))}
+    serves: ClassVar[Mapping[str, Between | OneOf]] = {
+        "epsilon": Between(8.0, 16.0),
+        "subset_size": OneOf((1, 2, 3, 4)),
+        "words": OneOf((0, 128_000)),
+    }
     quantised_by: ClassVar[str | None] = "dictionary"
+    truncated_by: ClassVar[str | None] = "words"
 
     epsilon: float = 10.0  # nats, per descriptor
     subset_size: int = 2  # words released per keypoint
     dictionary: Asset = Asset("shipped")
+    words: int = 0  # how many of the dictionary's words are used at most, from its first on; 0 is all
 
     def __post_init__(self) -> None:
         if not self.epsilon >= 0:  # NaN is refused too
             raise UserError(f"ldp: epsilon must be at least 0, got {self.epsilon}")
         if self.subset_size < 1:
             raise UserError(f"ldp: subset_size must be at least 1, got {self.subset_size}")
+        if self.words < 0 or self.words == 1:
+            raise UserError(f"ldp: words must be 0 for all, or at least 2, got {self.words}")
 
     def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> WordSets:
         known = self._known(public)
-        nearest = public.nearest_words(self.dictionary, secret)  # (N,) d'
+        nearest = public.nearest_words(self.dictionary, secret, self.words)  # (N,) d'
         words = word_subsets(nearest, len(known), self.epsilon, self.subset_size, rng)  # (N, m)
         candidates = unit_rows(known.words[words])  # (N, m, D)
         return WordSets(keypoints=secret.keypoints.copy(), size=secret.size, candidates=candidates, words=words)
@@ -54,7 +62,7 @@ class LDP(Defense):
 
     def _known(self, public: Public) -> Dictionary:
         """The dictionary, once it is known to hold enough words."""
-        known = public.dictionary(self.dictionary)
+        known = public.dictionary(self.dictionary, self.words)
         if len(known) < self.subset_size:
             raise UserError(f"ldp: subset_size is {self.subset_size}, but the dictionary has {len(known)} words")
         return known

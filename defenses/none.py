@@ -3,22 +3,48 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
+from bench.errors import UserError
 from bench.plugin import Defense, Privacy
 from bench.public import Public
-from bench.types import Descriptors, Features
+from bench.types import Descriptors, Features, Floats
+
+COLUMNS = {"positions": 0, "scale": 1, "scale-and-orientation": 2}  # of `Features.frames`
 
 
 @dataclass(frozen=True, kw_only=True)
 class Undefended(Defense):
-    """Releases the descriptors as they are."""
+    """Releases the descriptors as they are.
+
+    Clients may send more of a keypoint than its position: COLMAP's and hloc's files carry scale and orientation.
+    """
 
     releases = Descriptors
 
+    sends: Literal["positions", "scale", "scale-and-orientation"] = "positions"  # of a keypoint
+
+    def __post_init__(self) -> None:
+        if self.sends not in COLUMNS:
+            raise UserError(f"none: sends must be positions, scale or scale-and-orientation, got {self.sends}")
+
     def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> Descriptors:
-        return Descriptors(keypoints=secret.keypoints.copy(), size=secret.size, descriptors=secret.descriptors.copy())
+        return Descriptors(
+            keypoints=secret.keypoints.copy(),
+            size=secret.size,
+            descriptors=secret.descriptors.copy(),
+            frames=self._frames(secret),
+        )
+
+    def _frames(self, secret: Features) -> Floats | None:
+        columns = COLUMNS[self.sends]
+        if columns == 0:
+            return None
+        if secret.frames is None:
+            raise UserError(f"none: sends={self.sends}, but the extractor does not tell it")
+        return secret.frames[:, :columns].copy()
 
     def privacy(self, public: Public) -> Privacy:
         return Privacy("none")

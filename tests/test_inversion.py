@@ -61,9 +61,9 @@ def example_releases(rng, count=5):
 
 
 def test_every_kind_of_release_has_a_stacking(rng):
-    assert [stack(release).shape[1] for release in example_releases(rng)] == [1, 3, 17]
+    assert [stack(release, "invariant").shape[1] for release in example_releases(rng)] == [1, 3, 17]
     with pytest.raises(TypeError, match="no stacking"):
-        stack(object())
+        stack(object(), "invariant")
 
 
 def test_subspaces_are_read_as_themselves_and_not_as_they_were_written(rng):
@@ -74,7 +74,7 @@ def test_subspaces_are_read_as_themselves_and_not_as_they_were_written(rng):
 
     def stacked(point):
         origins, bases = reparameterise(point, span, rng)
-        return stack(Subspaces(**where, origins=origins, bases=bases))
+        return stack(Subspaces(**where, origins=origins, bases=bases), "invariant")
 
     first = stacked(d)
     np.testing.assert_allclose(first, stacked(d), atol=1e-5)
@@ -84,7 +84,7 @@ def test_subspaces_are_read_as_themselves_and_not_as_they_were_written(rng):
 
 def test_encoding_pads_and_places(rng):
     release = example_releases(rng)[1]
-    points = encode([release, release], [np.array([0.25], np.float32)] * 2, slots=4)
+    points = encode([release, release], [np.array([0.25], np.float32)] * 2, slots=4, encoding="invariant")
     assert points.values.shape == (10, 4 * 128 + 2 + 1)
     assert (points.values[:, 3 * 128 : 4 * 128] == 0).all()
     assert (points.values[:, -1] == 0.25).all()
@@ -92,13 +92,13 @@ def test_encoding_pads_and_places(rng):
     assert points.cells[0] == row * 128 + column
     assert points.cells[5] == 128 * 128 + row * 128 + column
     with pytest.raises(ValueError, match="at most 2"):
-        encode([release], [np.empty(0, np.float32)], slots=2)
+        encode([release], [np.empty(0, np.float32)], slots=2, encoding="invariant")
 
 
 def test_keypoints_on_the_border_stay_in_the_grid():
     corners = np.array([[0, 0], [256, 256], [-1, 300]], np.float32)
     release = Descriptors(keypoints=corners, size=(256, 256), descriptors=np.zeros((3, 128), np.float32))
-    points = encode([release], [np.empty(0, np.float32)], slots=1)
+    points = encode([release], [np.empty(0, np.float32)], slots=1, encoding="invariant")
     assert points.cells.tolist() == [0, 128 * 128 - 1, 127 * 128]
 
 
@@ -175,10 +175,12 @@ def test_a_network_started_from_another_reads_a_descriptor_as_it_does(slots, can
     rows = np.zeros((len(raw), slots, 128), np.float32)
     rows[:, 0] = raw.descriptors * np.float32(candidates**0.5)
     padded = WordSets(keypoints=raw.keypoints, size=raw.size, candidates=rows, words=None)
-    mine = fresh(encode([padded], [np.ones(1, np.float32)], slots))
-    theirs = trained(encode([raw], [np.empty(0, np.float32)], 1))
+    mine = fresh(encode([padded], [np.ones(1, np.float32)], slots, "invariant"))
+    theirs = trained(encode([raw], [np.empty(0, np.float32)], 1, "invariant"))
     torch.testing.assert_close(mine, theirs, atol=1e-4, rtol=1e-4)
-    assert not torch.allclose(Inverter(Shape(inputs=130)).eval()(encode([raw], [np.empty(0, np.float32)], 1)), theirs, atol=1e-2)
+    assert not torch.allclose(
+        Inverter(Shape(inputs=130)).eval()(encode([raw], [np.empty(0, np.float32)], 1, "invariant")), theirs, atol=1e-2
+    )
 
 
 def test_training_learns(sources, tmp_path):
@@ -251,7 +253,7 @@ def test_a_photograph_is_never_quantised_by_its_own_dictionary(sources, words, t
 def test_quantisation_once_is_quantisation_each_time(sources, words):
     views = collect(sources[3:4], Sift())
     chosen = {view.photograph: words for view in views}
-    table, plain = data.quantise(views, chosen, Public()), Public()
+    table, plain = data.quantise(views, chosen, [0], Public()), Public()
     for view in views:
         expected = plain.nearest_words(words, view.features)
         assert np.array_equal(table(plain.dictionary(words), view.features.codes), expected)
@@ -297,7 +299,7 @@ def test_weights_keep_the_network(sources, tmp_path, rng):
     net = Inverter(shape).eval()
     path = tmp_path / "W.safetensors"
     weights.save(path, net, shape, {"slots": 1, "serves": {}})
-    points = encode([example_releases(rng)[0]], [np.empty(0, np.float32)], slots=1)
+    points = encode([example_releases(rng)[0]], [np.empty(0, np.float32)], slots=1, encoding="invariant")
     torch.testing.assert_close(paint(weights.load(path).module, points), paint(net, points), atol=0.02, rtol=0)
     assert torch.equal(paint(net, points), paint(net, points))
 

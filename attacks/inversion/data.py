@@ -70,18 +70,12 @@ def _random_crop(view: PhotographView, rng: np.random.Generator) -> tuple[Bytes,
     while True:
         left, top = rng.integers(room + 1, size=2)
         moved = view.features.keypoints - np.array([left, top], dtype=np.float32)
-        inside = ((moved >= 0) & (moved < SIDE)).all(axis=1)
+        inside = np.all((moved >= 0) & (moved < SIDE), axis=1)
         if inside.any():
             break
         if room == 0:
             raise ValueError("a view of 256 x 256 pixels has no keypoint within it")
-    codes = view.features.codes
-    secret = Features(
-        keypoints=moved[inside],
-        descriptors=view.features.descriptors[inside],
-        codes=None if codes is None else codes[inside],
-        size=(SIDE, SIDE),
-    )
+    secret = dataclasses.replace(view.features, keypoints=moved, size=(SIDE, SIDE)).take(inside)
     return view.pixels[top : top + SIDE, left : left + SIDE], secret
 
 
@@ -128,17 +122,20 @@ def row_keys(rows: Bytes | Floats) -> np.ndarray:
     return ((mixed ^ (mixed >> np.uint64(29))) * factors[::-1]).sum(axis=1, dtype=np.uint64)
 
 
-def quantise(views: Sequence[PhotographView], dictionaries: Mapping[str, Asset], public: Public) -> Quantisation:
-    """Find the nearest words of all views' descriptors, each in its own photograph's dictionary."""
+def quantise(
+    views: Sequence[PhotographView], dictionaries: Mapping[str, Asset], sizes: Sequence[int], public: Public
+) -> Quantisation:
+    """Find the nearest words of all views' descriptors, each in its own photograph's dictionary at each of `sizes` (0: whole)."""
     tables = {}
-    total = sum(len(view.features) for view in views)
+    total = len(sizes) * sum(len(view.features) for view in views)
     with Progress("quantising", total) as progress:
         for asset in sorted(set(dictionaries.values())):
-            known = public.dictionary(asset)
             rows = np.concatenate([queries(view.features) for view in views if dictionaries[view.photograph] == asset])
             keys, first = _first_of_each(row_keys(rows))
-            tables[known.digest] = (keys, known.index.nearest(rows[first], progress.advance))
-            progress.advance(len(rows) - len(first))
+            for size in sizes:
+                known = public.dictionary(asset, size)
+                tables[known.digest] = (keys, known.index.nearest(rows[first], progress.advance))
+                progress.advance(len(rows) - len(first))
     return Quantisation(tables)
 
 

@@ -1,4 +1,4 @@
-"""A release as the network reads it: one row of numbers a keypoint, with the candidates of a keypoint stacked in order.
+"""A release as the network reads it: one row of numbers a keypoint, with the candidates of a keypoint stacked.
 
 Dense feature maps of 128·m channels (paper, Sec. 5.3) are never built: each keypoint is embedded first and scattered afterwards.
 """
@@ -9,6 +9,7 @@ import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import singledispatch
+from typing import Literal
 
 import numpy as np
 import torch
@@ -19,6 +20,7 @@ from bench.types import Descriptors, Floats, Release, Subspaces, WordSets
 
 CELL = 2  # pixels: the side of the cells that keypoints are scattered to
 DIRECTIONS = 16  # that are projected onto subspaces
+TYPICAL_SCALE = 4.0  # pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,31 +36,48 @@ class Points:
         return Points(self.values.to(device), self.cells.to(device), self.batch, self.grid)
 
 
-@singledispatch
-def stack(release: Release) -> Floats:
-    """What is released for a keypoint, stacked. -> (N, slots, D)
+# What a network is told of a keypoint: what was released as it was released (the paper's stacking: m words in order, or a random
+# origin and basis); the same so that nothing depends on an order or a basis that was drawn; or its position alone.
+Encoding = Literal["invariant", "released", "positions"]
+
+
+def stack(release: Release, encoding: Encoding) -> Floats:
+    """What the network is told of each keypoint beside its position, stacked. -> (N, slots, D)
+
+    Word sets are stacked as they were released under either encoding; the network that reads them is invariant, or is not.
 
     Raises
     ------
     TypeError
         if there is no stacking for this kind of release.
     """
+    if encoding == "positions":
+        return np.empty((len(release), 0, 0), dtype=np.float32)
+    return projections(release) if encoding == "invariant" and isinstance(release, Subspaces) else _released(release)
+
+
+@singledispatch
+def _released(release: Release) -> Floats:
     raise TypeError(f"no stacking is defined for {type(release).__name__}")
 
 
-@stack.register
+@_released.register
 def _(release: Descriptors) -> Floats:
     return release.descriptors[:, None]  # (N, 1, D)
 
 
-@stack.register
+@_released.register
 def _(release: WordSets) -> Floats:
     return release.candidates  # (N, m, D)
 
 
-@stack.register
+@_released.register
 def _(release: Subspaces) -> Floats:
-    """The projections onto D of zero and of fixed directions.
+    return np.concatenate([release.origins[:, None], release.bases], axis=1)  # (N, 1 + dim, D)
+
+
+def projections(release: Subspaces) -> Floats:
+    """The projections onto each subspace D of zero and of fixed directions. -> (N, 1 + 16, D)
 
     The defense projects random ones: they tell nothing, and an origin so drawn buries the descriptor in noise of its own length.
     These depend on D alone, and determine it while it has at most as many dimensions as there are directions.
@@ -67,7 +86,7 @@ def _(release: Subspaces) -> Floats:
     feet = release.origins - np.einsum("nm,nmd->nd", inner, release.bases)  # (N, D) the point of D nearest to zero
     inside = release.bases @ _directions(release.bases.shape[2]).T  # (N, dim, 16) coordinates
     shadows = inside.transpose(0, 2, 1) @ release.bases  # (N, 16, D)
-    return np.concatenate([feet[:, None], shadows], axis=1)  # (N, 1 + 16, D)
+    return np.concatenate([feet[:, None], shadows], axis=1)
 
 
 @functools.cache
@@ -92,12 +111,11 @@ def _extremes(settings: OneOf) -> tuple[float, float]:
     return min(numbers), max(numbers)
 
 
-def encode(releases: list[Release], conditions: list[Floats], slots: int) -> Points:
+def encode(releases: list[Release], conditions: list[Floats], slots: int, encoding: Encoding) -> Points:
     """Encode a batch.
 
-    A keypoint's row holds its stacked candidates, padded with zeros to `slots`; its place within its cell; the condition.
-
-    Keypoints outside the image count as being on its border.
+    A keypoint's row holds its stacked candidates, padded with zeros to `slots`; its place within its cell; its scale (octaves)
+    and orientation (cosine, sine) where they are sent; the condition. Keypoints outside the image count as being on its border.
 
     Raises
     ------
@@ -108,19 +126,28 @@ def encode(releases: list[Release], conditions: list[Floats], slots: int) -> Poi
     columns, rows = width // CELL, height // CELL
     values, cells = [], []
     for number, (release, known) in enumerate(zip(releases, conditions, strict=True)):
-        stacked = stack(release)  # (N, s, D)
+        stacked = stack(release, encoding)  # (N, s, D)
         count, used, length = stacked.shape
         if used > slots:
             raise ValueError(f"{used} candidates a keypoint, but the network was trained for at most {slots}")
-        row = np.zeros((count, slots * length + 2 + len(known)), dtype=np.float32)
+        candidates = np.zeros((count, slots * length), dtype=np.float32)
         # Unit rows of length D, scaled so that an element is about 1.
-        row[:, : used * length] = stacked.reshape(count, -1) * np.float32(length**0.5)
+        candidates[:, : used * length] = stacked.reshape(count, used * length) * np.float32(length**0.5)
         place = np.clip(release.keypoints, 0, np.array([width, height]) - 1e-3)
         cell = (place // CELL).astype(np.int64)  # (N, 2) column, row
-        row[:, slots * length : slots * length + 2] = place / CELL - cell - 0.5
-        row[:, slots * length + 2 :] = known
-        values.append(row)
+        within = place / CELL - cell - 0.5
+        told = np.broadcast_to(known, (count, len(known)))
+        values.append(np.concatenate([candidates, within, _frames(release), told], axis=1, dtype=np.float32))
         cells.append((number * rows + cell[:, 1]) * columns + cell[:, 0])
     return Points(
         torch.from_numpy(np.concatenate(values)), torch.from_numpy(np.concatenate(cells)), len(releases), (rows, columns)
     )
+
+
+def _frames(release: Release) -> Floats:
+    """Scale and orientation as numbers of order 1. -> (N, 0), (N, 1) or (N, 3)"""
+    frames = release.frames if isinstance(release, Descriptors) else None
+    if frames is None:
+        return np.empty((len(release), 0), dtype=np.float32)
+    octaves = np.log2(frames[:, :1] / TYPICAL_SCALE)
+    return np.concatenate([octaves, np.cos(frames[:, 1:]), np.sin(frames[:, 1:])], axis=1)

@@ -23,6 +23,8 @@ class Shape:
     """The network's sizes."""
 
     inputs: int  # numbers a keypoint
+    candidates: int = 0  # how many of them are embedded one by one and added up; 0: all numbers are embedded together
+    length: int = 0  # of one of these candidates
     hidden: int = 320  # width of the embedding MLP
     widths: tuple[int, ...] = (32, 64, 160, 224, 224)  # channels at 1/2, 1/4, ... of the image's side
 
@@ -33,8 +35,9 @@ class Inverter(nn.Module):
     def __init__(self, shape: Shape) -> None:
         super().__init__()
         first, *deeper = shape.widths
+        self.shape = shape
         self.embed = nn.Sequential(
-            nn.Linear(shape.inputs, shape.hidden),
+            nn.Linear(shape.inputs - max(0, shape.candidates - 1) * shape.length, shape.hidden),
             nn.SiLU(inplace=True),
             nn.Linear(shape.hidden, shape.hidden),
             nn.SiLU(inplace=True),
@@ -61,11 +64,21 @@ class Inverter(nn.Module):
     def scatter(self, points: Points) -> Tensor:
         """-> (B, first, H/2, W/2), channels last"""
         rows, columns = points.grid
-        embedded = self.embed(points.values)  # (P, first - 1)
+        embedded = self.embed_set(points.values) if self.shape.candidates else self.embed(points.values)  # (P, first - 1)
         counted = torch.cat([embedded, torch.ones_like(embedded[:, :1])], dim=1)
         grid = counted.new_zeros(points.batch * rows * columns, counted.shape[1])
         grid = grid.index_add(0, points.cells, counted)
         return grid.view(points.batch, rows, columns, -1).permute(0, 3, 1, 2)
+
+    def embed_set(self, values: Tensor) -> Tensor:
+        """Embed each candidate with what goes for all, and add up: their order says nothing. (P, F) -> (P, first - 1)"""
+        count, length = self.shape.candidates, self.shape.length
+        candidates = values[:, : count * length].view(-1, count, length)  # (P, m, D)
+        common = values[:, None, count * length :].expand(-1, count, -1)
+        *layers, last = self.embed
+        hidden = nn.Sequential(*layers)(torch.cat([candidates, common], dim=2))  # (P, m, hidden)
+        there = candidates.any(dim=2)[..., None]  # the others are padding
+        return last((hidden * there).sum(dim=1) / there.sum(dim=1).clamp(min=1).sqrt())
 
 
 def conv_norm(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:

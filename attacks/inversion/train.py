@@ -19,7 +19,7 @@ from torch import Tensor
 
 from attacks.inversion import weights
 from attacks.inversion.data import Example, Examples, Served, fitting_dictionaries, quantisation_error, quantise
-from attacks.inversion.encoding import Points, encode, stack
+from attacks.inversion.encoding import Encoding, Points, encode, stack
 from attacks.inversion.loss import reconstruction_loss, ssim
 from attacks.inversion.network import Inverter, Shape, paint
 from bench import tensorfile
@@ -65,6 +65,8 @@ def train(
     extractor: Extractor,
     crossfit: Sequence[Asset] = (),
     start: Path | None = None,
+    encoding: Encoding = "invariant",
+    widths: tuple[int, ...] = Shape.widths,
     training: Training = Training(),  # frozen
 ) -> dict[str, Any]:
     """Train, or resume, a network for the releases of `defense`, and return its metadata. What is done is not done again.
@@ -77,6 +79,8 @@ def train(
     out : the weights' file; a checkpoint is kept beside it until training is done
     crossfit : dictionaries for photographs that helped to make the defense's own
     start : weights of a network for raw descriptors to start from; random ones if None
+    encoding : what the network is told of a keypoint
+    widths : of the network's levels
 
     Raises
     ------
@@ -89,11 +93,13 @@ def train(
     views, unseen = collect(list(photographs), extractor), collect(list(validation), extractor)
     unseen = [view for view in unseen if len(view.pixels) == SIDE][::2]  # not the mirrored ones
     examples, held_out, errors = _examples(defense, served, views, unseen, crossfit)
-    slots = _slots(defense, examples, views[0])
-    sample = encode([(first := held_out.whole(unseen[0], np.random.default_rng(0))).release], [first.condition], slots)
-    shape = Shape(inputs=sample.values.shape[1])
+    slots, length = _stacked(defense, examples, views[0], encoding)
+    sample = encode([(first := held_out.whole(unseen[0], np.random.default_rng(0))).release], [first.condition], slots, encoding)
+    one_by_one = slots if encoding == "invariant" and defense.releases is WordSets else 0
+    shape = Shape(inputs=sample.values.shape[1], candidates=one_by_one, length=length, widths=widths)
     meta = {
         **weights.describe(defense, dict(served), extractor, Public()),
+        "encoding": encoding,
         "slots": slots,
         "start": None if start is None else weights.load(start).digest,
         "photographs": len({view.photograph for view in views}),
@@ -109,9 +115,10 @@ def train(
         return done
     trainer = _Trainer(shape, training, out, meta)
     if start is not None and trainer.step == 0:
-        trainer.start_from(weights.load(start).module, slots if defense.releases is WordSets else 1)
-    module = trainer.run(examples, slots)
-    meta["validation"] = validate(module, held_out, unseen[:VALIDATE_AT_MOST], slots)
+        read_as_descriptors = slots if defense.releases is WordSets and not one_by_one else 1
+        trainer.start_from(weights.load(start).module, read_as_descriptors)
+    module = trainer.run(examples)
+    meta["validation"] = validate(module, held_out, unseen[:VALIDATE_AT_MOST], slots, encoding)
     weights.save(out, module, shape, meta)
     _checkpoint_path(out).unlink(missing_ok=True)
     return meta
@@ -134,7 +141,7 @@ def _examples(
     plain = Public()
     chosen = fitting_dictionaries({view.photograph for view in views}, [own, *crossfit], plain)
     chosen_unseen = fitting_dictionaries({view.photograph for view in unseen}, [own], plain)
-    public = Public(quantise(views, chosen, plain), remembered=0)
+    public = Public(quantise(views, chosen, sorted({0, *_sizes(defense, served)}), plain), remembered=0)
     examples, held_out = Examples(views, defense, served, chosen, public), Examples(unseen, defense, served, chosen_unseen, plain)
     upright = [view for view in views if len(view.pixels) == SIDE][::2]
     errors = {
@@ -143,6 +150,14 @@ def _examples(
     }
     check_quantisation(errors["training"], errors["validation"])
     return examples, held_out, errors
+
+
+def _sizes(defense: Defense, served: Served) -> list[int]:
+    """How many words the dictionary may have in training."""
+    if defense.truncated_by is None:
+        return [0]
+    setting = served.get(defense.truncated_by)
+    return [int(size) for size in setting.values] if isinstance(setting, OneOf) else [getattr(defense, defense.truncated_by)]
 
 
 def check_quantisation(training: float, validation: float) -> None:
@@ -161,12 +176,13 @@ def check_quantisation(training: float, validation: float) -> None:
         )
 
 
-def _slots(defense: Defense, examples: Examples, view: PhotographView) -> int:
-    """The most candidates a keypoint among the served settings: the greatest setting of each field, the others at theirs."""
+def _stacked(defense: Defense, examples: Examples, view: PhotographView, encoding: Encoding) -> tuple[int, int]:
+    """The most candidates a keypoint among the served settings (the greatest of each field), and the length of one."""
     most = {field: max(setting.values) for field, setting in examples.served.items() if isinstance(setting, OneOf)}
     fixed = {field: OneOf((value,)) for field, value in most.items()}
     largest = Examples(examples.views, defense, {**examples.served, **fixed}, examples.dictionaries, examples.public)
-    return stack(largest.whole(view, np.random.default_rng(0)).release).shape[1]
+    _, slots, length = stack(largest.whole(view, np.random.default_rng(0)).release, encoding).shape
+    return slots, length
 
 
 def _checkpoint_path(out: Path) -> Path:
@@ -194,13 +210,13 @@ class _Trainer:
         weights.start_from(self.module, trained, candidates)
         self.average = {name: value.clone() for name, value in self.module.state_dict().items()}
 
-    def run(self, examples: Examples, slots: int) -> Inverter:
+    def run(self, examples: Examples) -> Inverter:
         """Train to the end and return the network with averaged weights."""
         if self.step == self.training.steps:
             return self._averaged()
         with Progress("training", self.training.steps - self.step) as progress:
             started, before, smooth = time.monotonic(), self.step, math.nan
-            for points, photographs in _batches(examples, slots, self.training, self.step):
+            for points, photographs in _batches(examples, self.meta["slots"], self.meta["encoding"], self.training, self.step):
                 loss = self._advance(points.to(self.device), photographs.to(self.device))
                 smooth = loss if math.isnan(smooth) else 0.98 * smooth + 0.02 * loss
                 speed = (self.step - before) * self.training.batch / (time.monotonic() - started)
@@ -261,12 +277,14 @@ class _Trainer:
         self.optimizer.load_state_dict(state)
 
 
-def _batches(examples: Examples, slots: int, training: Training, start: int) -> Iterator[tuple[Points, Tensor]]:
+def _batches(
+    examples: Examples, slots: int, encoding: Encoding, training: Training, start: int
+) -> Iterator[tuple[Points, Tensor]]:
     """Batches from step `start` on, the next being made while one is used."""
 
     def make(step: int) -> tuple[Points, Tensor]:
         rng = np.random.default_rng([training.seed, step])
-        return to_batch([examples.draw(rng) for _ in range(training.batch)], slots)
+        return to_batch([examples.draw(rng) for _ in range(training.batch)], slots, encoding)
 
     with ThreadPoolExecutor(1) as ahead:
         upcoming = ahead.submit(make, start)
@@ -277,19 +295,21 @@ def _batches(examples: Examples, slots: int, training: Training, start: int) -> 
             yield ready
 
 
-def to_batch(examples: Sequence[Example], slots: int) -> tuple[Points, Tensor]:
+def to_batch(examples: Sequence[Example], slots: int, encoding: Encoding) -> tuple[Points, Tensor]:
     """-> the encoded releases, (B, 3, 256, 256) photographs in [0, 1]"""
-    points = encode([example.release for example in examples], [example.condition for example in examples], slots)
+    points = encode([example.release for example in examples], [example.condition for example in examples], slots, encoding)
     pixels = torch.from_numpy(np.stack([example.pixels for example in examples]))
     return points, pixels.permute(0, 3, 1, 2).float() / 255
 
 
-def validate(module: Inverter, examples: Examples, views: Sequence[PhotographView], slots: int) -> dict[str, float]:
+def validate(
+    module: Inverter, examples: Examples, views: Sequence[PhotographView], slots: int, encoding: Encoding
+) -> dict[str, float]:
     """Mean MAE, SSIM (where its window fits) and PSNR over whole views, under settings drawn with a fixed seed."""
     device, rng = pick_device(), np.random.default_rng(0)
     scores = []
     for view in views:
-        points, truth = to_batch([examples.whole(view, rng)], slots)
+        points, truth = to_batch([examples.whole(view, rng)], slots, encoding)
         painted = paint(module, points.to(device)).cpu()
         mse = float((painted - truth).square().mean())
         scores.append((float((painted - truth).abs().mean()), float(ssim(painted[0], truth[0])), -10 * math.log10(mse)))

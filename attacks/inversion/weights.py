@@ -118,9 +118,14 @@ def misfit(meta: dict[str, Any], defense: Defense, extractor: Extractor, public:
     for field, text in meta["serves"].items():
         if getattr(defense, field) not in _setting(text):
             return f"trained for {field} {_setting(text)}, not {getattr(defense, field)}"
-    for field, value in meta["defense"].items():
-        if have.get(field) != value:
-            return f"trained for {field} {value}, not {have.get(field)}"
+    for field in sorted((have.keys() | meta["defense"].keys()) - meta["serves"].keys()):
+        if have.get(field) != meta["defense"].get(field):
+            return f"trained for {field} {meta['defense'].get(field)}, not {have.get(field)}"
+    return other_features(meta, extractor, public)
+
+
+def other_features(meta: dict[str, Any], extractor: Extractor, public: Public) -> str | None:
+    """Why a network was not trained for the features of `extractor`; None if it was."""
     features = spec.configuration(extractor, public)
     for field in sorted(meta["extractor"].keys() | features.keys()):
         if meta["extractor"].get(field) != features.get(field):

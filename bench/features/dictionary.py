@@ -42,6 +42,12 @@ class Dictionary:
         """Finds the nearest words of descriptors."""
         return WordIndex(self.words)
 
+    def first(self, count: int) -> Dictionary:
+        """The dictionary of the first `count` words, or of all: rows are in random order, so that they are as good as any."""
+        if count >= len(self):
+            return self
+        return Dictionary(self.words[:count], self.meta, f"{self.digest}, first {count}")
+
     def sub_database(self, index: int, count: int) -> Bytes:
         """The rows of sub-database `index` of `count`, by the rule at the top of this file."""
         size = len(self.words)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -47,9 +48,12 @@ class Sift(Extractor):
         points, values = sift.compute(grey, points)
         codes = values.astype(np.uint8)  # OpenCV rounds to 0..255 and hands them out as float32
         xy = np.array([point.pt for point in points], dtype=np.float32) + 0.5  # OpenCV's centre of the first pixel is 0
+        frames = np.array([(point.size, math.radians(point.angle)) for point in points], dtype=np.float32)  # (N, 2)
         keep = codes.any(axis=1)
         height, width = grey.shape
-        found = Features(keypoints=xy[keep], descriptors=unit_rows(codes[keep]), codes=codes[keep], size=(width, height))
+        found = Features(
+            keypoints=xy[keep], descriptors=unit_rows(codes[keep]), codes=codes[keep], size=(width, height), frames=frames[keep]
+        )
         return found.by_position()
 
 

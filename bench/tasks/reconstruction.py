@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -13,7 +14,9 @@ from bench import fields, registry, spec
 from bench.errors import UnitError, UserError, blamed
 from bench.plugin import Attack, Defense, DescriptorAttack, Extractor, ImageAttack, Metric, Outcome, Task, Trial, View
 from bench.public import Public
-from bench.types import Descriptors, Floats, Knowledge, Release
+from bench.types import Descriptors, Floats, Knowledge
+
+RELEASES = {Knowledge.OTHER_RELEASES, Knowledge.REPEATED_RELEASES}  # which every defense can make
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +33,7 @@ class Reconstruction(Task):
     def inapplicable(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> str | None:
         if attack is None:
             return "reconstruction needs an attack"
-        missing = attack.needs - offered(attack, defense, public).keys()
+        missing = attack.needs - offered(attack, defense, public).keys() - RELEASES
         if missing:
             wanted = " and ".join(sorted(need.value for need in missing))
             return f"{attack.name()} needs {wanted}; there is none for {defense.name()}"
@@ -39,8 +42,9 @@ class Reconstruction(Task):
     def resolved(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> Mapping[str, Any]:
         if attack is None:
             return {}
-        for load in granted(attack, defense, public).values():
-            load()
+        for what, load in offered(attack, defense, public).items():
+            if what in attack.needs:
+                load()
         digests = dict(attack.assets(defense, extractor, public))
         if not isinstance(attack, DescriptorAttack):
             return digests
@@ -52,7 +56,7 @@ class Reconstruction(Task):
     def judge(self, trial: Trial) -> Outcome:
         attack = trial.attack
         if isinstance(attack, ImageAttack):
-            return compared(trial, None, reconstructed(attack, trial.defense, trial.release, trial))
+            return compared(trial, None, reconstructed(attack, view(trial), trial.rng))
         if not isinstance(attack, DescriptorAttack):
             raise UnitError("reconstruction needs an attack")
         found = recovered(attack, trial)
@@ -60,7 +64,8 @@ class Reconstruction(Task):
         if reason is not None:
             return compared(trial, found, None, (f"no image: {reason}",))
         release = Descriptors(keypoints=trial.release.keypoints, size=trial.release.size, descriptors=found)
-        return compared(trial, found, reconstructed(inverter, undefended, release, trial))
+        seen = view(dataclasses.replace(trial, attack=inverter, defense=undefended, release=release))
+        return compared(trial, found, reconstructed(inverter, seen, trial.rng))
 
     def _inverter(self, extractor: Extractor, public: Public) -> tuple[ImageAttack, Defense, str | None]:
         """The attack that paints descriptors, the defense that it was made for, and why it cannot be used, if it cannot."""
@@ -72,7 +77,7 @@ class Reconstruction(Task):
 
 
 def offered(attack: Attack, defense: Defense, public: Public) -> dict[Knowledge, Callable[[], Any]]:
-    """What there is to know beside a release made by that defense."""
+    """What there is to know beside releases made by that defense."""
     databases = fields.asset_fields(defense)
     own = fields.asset_fields(attack).get("database", "shipped-public")
     offers: dict[Knowledge, Callable[[], Any]] = {
@@ -84,21 +89,27 @@ def offered(attack: Attack, defense: Defense, public: Public) -> dict[Knowledge,
     return offers
 
 
-def granted(attack: Attack, defense: Defense, public: Public) -> dict[Knowledge, Callable[[], Any]]:
-    """Of what there is to know, that which the attack declared to need."""
-    return {what: load for what, load in offered(attack, defense, public).items() if what in attack.needs}
+def view(trial: Trial) -> View:
+    """All that the attack gets: copies of what was released, and of the rest only what it declared to need."""
+    attack = trial.attack
+    assert attack is not None
+    offers = offered(attack, trial.defense, trial.public) | {
+        Knowledge.OTHER_RELEASES: lambda: lambda count: map(copy.deepcopy, trial.others(count)),
+        Knowledge.REPEATED_RELEASES: lambda: copy.deepcopy(list(trial.repeats)),
+    }
+    return View(
+        release=copy.deepcopy(trial.release),  # whatever the attack does to it, the next attack sees what was released
+        defense=trial.defense,
+        extractor=trial.extractor,
+        knowledge={what: load for what, load in offers.items() if what in attack.needs},
+    )
 
 
-def view(attack: Attack, defense: Defense, release: Release, extractor: Extractor, public: Public) -> View:
-    """All that the attack gets. The release is a copy: whatever the attack does to it, the next attack sees what was released."""
-    return View(release=copy.deepcopy(release), defense=defense, extractor=extractor, knowledge=granted(attack, defense, public))
-
-
-def reconstructed(attack: ImageAttack, defense: Defense, release: Release, trial: Trial) -> Floats:
+def reconstructed(attack: ImageAttack, seen: View, rng: np.random.Generator) -> Floats:
     """The attacker's image. -> (H, W, 3)"""
     with blamed(f"plugin {attack.name()}"):
-        image = attack.reconstruct(view(attack, defense, release, trial.extractor, trial.public), trial.rng)
-        width, height = release.size
+        image = attack.reconstruct(seen, rng)
+        width, height = seen.release.size
         _expect(image, (height, width, 3))
         if image.min() < 0 or image.max() > 1:
             raise ValueError(f"returned values from {image.min()} to {image.max()}, expected 0 to 1")
@@ -108,8 +119,7 @@ def reconstructed(attack: ImageAttack, defense: Defense, release: Release, trial
 def recovered(attack: DescriptorAttack, trial: Trial) -> Floats:
     """The attacker's descriptors. -> (N, D)"""
     with blamed(f"plugin {attack.name()}"):
-        seen = view(attack, trial.defense, trial.release, trial.extractor, trial.public)
-        descriptors = attack.recover(seen, trial.rng)
+        descriptors = attack.recover(view(trial), trial.rng)
         _expect(descriptors, trial.secret.descriptors.shape)
     return descriptors
 
