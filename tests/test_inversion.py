@@ -82,6 +82,52 @@ def test_subspaces_are_read_as_themselves_and_not_as_they_were_written(rng):
     assert np.abs(first - stacked(rng.normal(size=(20, 128)))).max() > 0.1
 
 
+def test_the_papers_stacking_changes_with_the_basis_that_was_drawn(rng):
+    d, span = rng.normal(size=(20, 128)), np.linalg.qr(rng.normal(size=(20, 128, 6)))[0].transpose(0, 2, 1)
+    where = {"keypoints": np.zeros((20, 2), np.float32), "size": (256, 256)}
+
+    def stacked():
+        origins, bases = reparameterise(d, span, rng)
+        return stack(Subspaces(**where, origins=origins, bases=bases), "released")
+
+    assert stacked().shape == (20, 1 + 6, 128)
+    assert np.abs(stacked() - stacked()).max() > 0.1
+
+
+def test_positions_alone_encode_no_descriptor(rng):
+    first, second, third = (encode([release], [np.empty(0, np.float32)], 0, "positions") for release in example_releases(rng))
+    assert first.values.shape == (5, 2)
+    assert torch.equal(first.values, second.values)
+    assert torch.equal(first.values, third.values)
+
+
+def test_frames_are_encoded_where_they_are_sent(rng):
+    release = example_releases(rng)[0]
+    framed = dataclasses.replace(release, frames=np.array([[8.0, np.pi / 2]] * 5, np.float32))
+    values = encode([framed], [np.ones(1, np.float32)], 1, "invariant").values
+    np.testing.assert_allclose(values[:, 130:], [[1, 0, 1, 1]] * 5, atol=1e-6)  # an octave over 4 pixels, cosine, sine; condition
+    scaled = dataclasses.replace(framed, frames=framed.frames[:, :1])
+    assert encode([scaled], [np.ones(1, np.float32)], 1, "invariant").values.shape == (5, 128 + 2 + 1 + 1)
+
+
+def test_a_set_network_ignores_order_and_padding(rng):
+    release = example_releases(rng)[1]
+    shuffled = dataclasses.replace(release, candidates=release.candidates[:, ::-1])
+    told = [np.ones(1, np.float32)]
+
+    def painted(network, of, slots):
+        return network(encode([of], told, slots, "invariant"))
+
+    torch.manual_seed(0)
+    reads_sets = Inverter(Shape(inputs=4 * 128 + 3, candidates=4, length=128)).eval()
+    torch.testing.assert_close(painted(reads_sets, release, 4), painted(reads_sets, shuffled, 4))
+    fewer = Inverter(Shape(inputs=3 * 128 + 3, candidates=3, length=128)).eval()
+    fewer.load_state_dict(reads_sets.state_dict())
+    torch.testing.assert_close(painted(fewer, release, 3), painted(reads_sets, release, 4))
+    reads_stacks = Inverter(Shape(inputs=4 * 128 + 3)).eval()  # negative control
+    assert not torch.allclose(painted(reads_stacks, release, 4), painted(reads_stacks, shuffled, 4), atol=1e-4)
+
+
 def test_encoding_pads_and_places(rng):
     release = example_releases(rng)[1]
     points = encode([release, release], [np.array([0.25], np.float32)] * 2, slots=4, encoding="invariant")

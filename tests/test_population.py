@@ -1,0 +1,74 @@
+"""Other users' releases: endless, repeatable, and never of the photograph that is attacked."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fakes import album
+
+from bench import runner
+from bench.datasets.photographs import Source, folder
+from bench.features.sift import Sift
+from bench.kernels.search import unit_rows
+from bench.population import Population, window
+from bench.public import Public
+from defenses.none import Undefended
+
+
+def randomness(*parts: object) -> np.random.Generator:
+    return runner.randomness("test", *parts)
+
+
+@pytest.fixture
+def sources(tmp_path: Path) -> list[Source]:
+    return folder(album(tmp_path / "album", 3))
+
+
+def population(sources: list[Source]) -> Population:
+    return Population(sources, Sift(), Undefended(), Public(), randomness)
+
+
+def similarity(release, source: Source) -> float:
+    """How much of a release is seen, mirrored or not, in a photograph at its own size: mean greatest cosine."""
+    seen = [Sift().extract(window(source, np.random.default_rng(seed))).descriptors for seed in range(8)]
+    return float((unit_rows(release.descriptors) @ np.concatenate(seen).T).max(axis=1).mean())
+
+
+def test_the_list_goes_on_and_is_the_same_each_time(sources) -> None:
+    first = list(population(sources).without("0.png")(7))
+    assert len(first) == 7
+    again = list(population(sources).without("0.png")(9))
+    for one, other in zip(first, again, strict=False):
+        assert np.array_equal(one.descriptors, other.descriptors)
+    assert not np.array_equal(first[0].keypoints, first[2].keypoints)  # another window of the same photograph
+
+
+def test_it_leaves_out_the_attacked_photograph(sources) -> None:
+    releases = list(population(sources).without("0.png")(6))
+    to_the_attacked = np.mean([similarity(release, sources[0]) for release in releases])
+    to_the_others = np.mean([max(similarity(release, source) for source in sources[1:]) for release in releases])
+    assert to_the_others > to_the_attacked + 0.05
+    everything = list(population(sources).without("none of them")(6))  # negative control: then it is among them
+    assert np.mean([similarity(release, sources[0]) for release in everything[::3]]) > to_the_attacked + 0.05
+
+
+def test_an_attacker_of_one_photograph_sees_what_another_sees(sources) -> None:
+    """The k-th release does not depend on whose attacker asks."""
+    everyone = population(sources)
+    of_first = [release.keypoints for release in everyone.without("0.png")(4)]
+    of_second = [release.keypoints for release in everyone.without("1.png")(4)]
+    assert any(np.array_equal(a, b) for a in of_first for b in of_second)
+
+
+def test_photographs_that_cannot_be_read_are_passed_over(sources, tmp_path) -> None:
+    broken = Source("broken.png", tmp_path / "broken.png")
+    broken.path.write_bytes(b"no image")
+    assert len(list(population([*sources, broken]).without("0.png")(5))) == 5
+    assert list(population([broken, sources[0]]).without("0.png")(5)) == []
+    assert list(population(sources[:1]).without("0.png")(5)) == []
+
+
+def test_windows_are_squares_of_the_photograph(sources) -> None:
+    assert all(window(sources[0], np.random.default_rng(seed)).shape == (256, 256, 3) for seed in range(4))
+    first, second = (window(sources[0], np.random.default_rng(seed)) for seed in (0, 1))
+    assert not np.array_equal(first, second)
