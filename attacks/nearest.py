@@ -29,8 +29,9 @@ class Nearest(DescriptorAttack):
         release = view.release
         if not isinstance(release, Subspaces):
             raise TypeError(f"nearest attacks Subspaces, got {type(release).__name__}")
-        words = unit_rows(view.know(Knowledge.PUBLIC_DATABASE).words)  # (K, D)
-        return words[nearest_to_subspaces(release, words)[0]]
+        words = view.know(Knowledge.PUBLIC_DATABASE).words  # (K, D)
+        nearest, _ = nearest_to_subspaces(release, words)  # (N, 1)
+        return unit_rows(words[nearest[:, 0]])
 
 
 PLUGIN = Nearest

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, final
 
 import numpy as np
 
-from bench.types import Bytes, Features, Floats, Knowledge, Release
+from bench.types import Bytes, Features, Floats, Knowledge, Release, Subspaces
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -94,6 +94,20 @@ class Defense(Plugin, ABC):
     @abstractmethod
     def privacy(self, public: Public) -> Privacy:
         """What is promised of one descriptor, and where it can be computed, the chance that it is told."""
+
+
+class Lifting(Defense):
+    """A defense that hides each descriptor in a subspace, and may lead it through words of a database on purpose.
+
+    How many words is public, as the whole configuration is; an attack on such words asks for this type.
+    """
+
+    releases = Subspaces
+
+    @property
+    @abstractmethod
+    def adversarial(self) -> int:
+        """Words of the database that a subspace goes through."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

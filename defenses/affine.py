@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from bench.errors import UnitError, UserError
 from bench.kernels.search import unit_rows
 from bench.kernels.subset import draw_distinct
-from bench.plugin import Asset, Between, Defense, OneOf, Privacy
+from bench.plugin import Asset, Between, Lifting, OneOf, Privacy
 from bench.public import Public
 from bench.types import Bytes, Features, Floats, Subspaces
 
@@ -28,13 +28,12 @@ TRIES = 100
 
 
 @dataclass(frozen=True, kw_only=True)
-class Affine(Defense):
+class Affine(Lifting):
     """Releases a random affine subspace through the descriptor and, unless lifting=random, through words of a database.
 
     The adversarial words of a photograph come from one sub-database, drawn for it; those of a keypoint are distinct.
     """
 
-    releases = Subspaces
     serves: ClassVar[Mapping[str, Between | OneOf]] = {"dim": OneOf((2, 4, 6, 8, 10, 12, 14, 16))}
 
     lifting: Literal["random", "adversarial", "hybrid"] = "hybrid"  # none, all or half of the directions lead to words
@@ -54,7 +53,6 @@ class Affine(Defense):
 
     @property
     def adversarial(self) -> int:
-        """Words that a subspace goes through."""
         return {"random": 0, "hybrid": self.dim // 2, "adversarial": self.dim}[self.lifting]
 
     def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> Subspaces:

@@ -18,8 +18,9 @@ BLOCK = 2048  # words in a block: a block and its scores stay in the cache
 BATCH = 512  # queries that share one reading of the words
 
 # How far below the greatest approximate cosine the true one can be. A rounding errs by half a unit in the last place, for bf16
-# by 2^-9 of the number; there are three, of both factors and of the result; two scores are compared; Cauchy-Schwarz bounds sums.
-MARGIN = {torch.bfloat16: 2 * 3 * 2.0**-9 + 1e-4, torch.float32: 1e-4}
+# (8 binary digits) by at most 2^-8 of the number; there are three, of both factors and of the result; two scores are compared;
+# Cauchy-Schwarz bounds sums. The rest is for products of these errors and for sums in float32.
+MARGIN = {torch.bfloat16: 2 * 3 * 2.0**-8 + 2e-4, torch.float32: 1e-4}
 
 
 def unit_rows(rows: Bytes | Floats) -> Floats:

@@ -1,66 +1,156 @@
-"""Distances between words and affine subspaces.
+"""The words nearest to affine subspaces: a fast pass finds which words they can be, float64 decides among them.
 
-With p the point of D nearest to zero and B its orthonormal basis, dist(D, w)² = |w|² + |p|² − 2 w·p − |B w|², so that most of
-the work is one matrix product: 2·N·(dim + 1)·K·D operations.
+With p the point of D nearest to zero and B its orthonormal basis, a unit word u has dist(D, u)² = 1 + |p|² − s and s = 2 p·u + |B u|².
+So nearly all of the work is one matrix product, 2·N·(dim + 1)·K·D operations: the floor.
+
+Why no near word is lost. The fast pass rounds p, B and each product, so that its score is off by at most E (`_error`). Of the
+`count` words that it scores highest, the lowest has s' and so a true score of at least s' − E; a word that it scores below s' − 2 E
+has a true score below that. Every other word is handed on. Zero is no special case, and is told from small by float64 alone.
 """
 
 from __future__ import annotations
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from bench.device import pick_device
-from bench.types import Floats, Indices, Subspaces
+from bench.device import pick_device, pick_dtype
+from bench.kernels.search import unit_rows
+from bench.types import Bytes, Floats, Indices, Subspaces
 
-BLOCK = 2048  # words at a time, so that a block's products stay near the processor
-BATCH = 128  # subspaces at a time
-SHORTLIST = 4  # words that float32 hands on to float64
+Doubles = NDArray[np.float64]
+
+BLOCK = 2048  # words in a block
+ROWS = 1024  # rows of B and p that share one reading of the words: a block of products stays near the processor
+GROUP = 32  # words that are looked at one by one only if the best of them may count
+PAIRS = 1024  # pairs of a subspace and a word that float64 looks at together
 
 
-def nearest_to_subspaces(release: Subspaces, words: Floats) -> tuple[Indices, Floats]:
-    """For each subspace the nearest of (K, D) unit words, ties to the lowest index, and its distance. -> (N,), (N,)
+def nearest_to_subspaces(release: Subspaces, words: Bytes | Floats, count: int = 1) -> tuple[Indices, Doubles]:
+    """The nearest words of each subspace, nearest first, ties to the lowest index, and their distances.
 
-    Float32 finds the four best words of a subspace, float64 orders them.
+    Parameters
+    ----------
+    words : (K, D) uint8 or float32, none zero; their directions count, as `unit_rows` gives them
+    count : how many words; all, if there are fewer
+
+    Returns
+    -------
+    (N, min(count, K)) int64 and float64. Distances are those of float64 from the subspace as it was released: in float32, so that
+    a word which the defense put there lies about 1e-7 off.
     """
+    count = min(count, len(words))
+    feet, frames = feet_and_frames(release)
+    found = np.empty((len(release), count), dtype=np.int64)
+    distances = np.empty((len(release), count))
+    step = max(1, ROWS // (release.dim + 1))
+    for start in range(0, len(release), step):
+        batch = slice(start, start + step)
+        rows, near = _possible(feet[batch], frames[batch], words, count)
+        found[batch], distances[batch] = _decide(feet[batch], frames[batch], words, rows, near, count)
+    return found, distances
+
+
+def feet_and_frames(release: Subspaces) -> tuple[Doubles, Doubles]:
+    """The point of each subspace nearest to zero, and a basis orthonormal to float64. -> (N, D), (N, dim, D)"""
+    frames = np.linalg.qr(release.bases.astype(np.float64).transpose(0, 2, 1))[0].transpose(0, 2, 1)
+    return _outside(release.origins.astype(np.float64), frames), frames
+
+
+def project(release: Subspaces, points: Doubles) -> Doubles:
+    """The point of each subspace nearest to its own point. (N, D) -> (N, D)"""
+    feet, frames = feet_and_frames(release)
+    return points - _outside(points - feet, frames)
+
+
+def _outside(offsets: Doubles, frames: Doubles) -> Doubles:
+    """The part of each vector that is orthogonal to the subspace. (n, D), (n, dim, D) -> (n, D)
+
+    Each row is summed by itself, and so equal rows give equal results wherever they stand.
+    """
+    return offsets - np.einsum("nm,nmd->nd", np.einsum("nmd,nd->nm", frames, offsets), frames)
+
+
+def _possible(feet: Doubles, frames: Doubles, words: Bytes | Floats, count: int) -> tuple[Indices, Indices]:
+    """Pairs of a subspace and a word that may be one of its nearest. (n, D), (n, dim, D), (K, D) -> (P,), (P,)"""
     device = pick_device()
-    rows = torch.from_numpy(words).to(device)
-    origins, bases = torch.from_numpy(release.origins).to(device), torch.from_numpy(release.bases).to(device)
-    found, distances = [], []
-    for points, frames in zip(origins.split(BATCH), bases.split(BATCH), strict=True):
-        shortlist = _shortlist(points, frames, rows)  # (n, 4)
-        exact = _distances(points.double(), frames.double(), rows[shortlist].double())  # (n, 4)
-        # Ascending indices first, so that the first of equal distances is the lowest index.
-        shortlist, order = shortlist.sort(dim=1)
-        exact = exact.gather(1, order)
-        best = exact.argmin(dim=1, keepdim=True)
-        found.append(shortlist.gather(1, best)[:, 0].cpu())
-        distances.append(exact.gather(1, best)[:, 0].cpu())
-    if not found:
-        return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.float32)
-    return torch.cat(found).numpy(), torch.cat(distances).float().numpy()
+    dtype = pick_dtype(device)
+    exact = np.concatenate([feet[:, None], frames], axis=1).transpose(1, 0, 2)  # (1 + dim, n, D)
+    coarse = torch.from_numpy(exact).to(dtype)
+    allowed = (
+        torch.from_numpy(2 * _error(exact, coarse.double().numpy(), dtype, words.dtype)).float().to(device)[:, None]
+    )  # (n, 1)
+    planes = coarse.to(device)
+    # The highest scores of the words so far, no two of one group: the lowest of them bounds the count-th highest from below.
+    best = torch.full((len(feet), count), torch.finfo(torch.float32).min, device=device)
+    pairs = []
+    for start in range(0, len(words), BLOCK):
+        scores = _scores(planes, torch.from_numpy(words[start : start + BLOCK]).to(device))  # (n, K')
+        ragged = -scores.shape[1] % GROUP
+        if ragged:
+            scores = torch.nn.functional.pad(scores, (0, ragged), value=-torch.inf)
+        groups = scores.view(len(feet), GROUP, -1)  # (n, 32, G)
+        maxima = groups.amax(dim=1)  # (n, G)
+        best = torch.cat([best, maxima], dim=1).topk(count, dim=1).values
+        least = best[:, -1:] - allowed  # (n, 1)
+        row, group = (maxima >= least).nonzero(as_tuple=True)
+        members = groups[row, :, group]  # (S, 32)
+        hit, place = (members >= least[row]).nonzero(as_tuple=True)
+        pairs.append((row[hit], start + place * groups.shape[2] + group[hit], members[hit, place]))
+    rows, near, found = (torch.cat(part) for part in zip(*pairs, strict=True))
+    kept = found >= least[rows, 0]  # as it stands now that all words were seen
+    return rows[kept].cpu().numpy(), near[kept].cpu().numpy()
 
 
-def _shortlist(points: Tensor, frames: Tensor, rows: Tensor) -> Tensor:
-    """Indices of the words nearest to each subspace by float32. (n, D), (n, dim, D), (K, D) -> (n, 4)"""
-    count, dim, length = frames.shape
-    # The point of D nearest to zero makes B(w - p) = B w.
-    feet = points - torch.einsum("nmd,nm->nd", frames, torch.einsum("nmd,nd->nm", frames, points))
-    flat = frames.reshape(count * dim, length)
-    scores = torch.empty(count, 0, device=points.device)
-    indices = torch.empty(count, 0, dtype=torch.int64, device=points.device)
-    for start in range(0, len(rows), BLOCK):
-        block = rows[start : start + BLOCK].T  # (D, K')
-        score = 2 * (feet @ block) + (flat @ block).square_().view(count, dim, -1).sum(dim=1)  # (n, K')
-        value, place = score.topk(min(SHORTLIST, score.shape[1]), dim=1)
-        scores, indices = torch.cat([scores, value], dim=1), torch.cat([indices, place + start], dim=1)
-        scores, kept = scores.topk(min(SHORTLIST, scores.shape[1]), dim=1)
-        indices = indices.gather(1, kept)
-    return indices
+def _scores(planes: Tensor, block: Tensor) -> Tensor:
+    """2 p·u + |B u|², about. (1 + dim, n, D), (K', D) -> (n, K') float32"""
+    scale = block.float().square().sum(dim=1).rsqrt()  # (K',) words are multiplied as they are: bytes are exact in bf16
+    products = (planes.flatten(0, 1) @ block.to(planes.dtype).T).unflatten(0, planes.shape[:2])  # (1 + dim, n, K')
+    scores = torch.zeros(products.shape[1:], device=planes.device)
+    for product in products[1:]:  # one after the other, so that a copy in float32 stays in the cache
+        wide = product.float()
+        scores.addcmul_(wide, wide)
+    return scores.mul_(scale).add_(products[0], alpha=2).mul_(scale)
 
 
-def _distances(points: Tensor, frames: Tensor, candidates: Tensor) -> Tensor:
-    """dist(D, w) in float64. (n, D), (n, dim, D), (n, c, D) -> (n, c)"""
-    offsets = candidates - points[:, None]  # (n, c, D)
-    inside = torch.einsum("ncd,nmd->ncm", offsets, frames)
-    return (offsets - torch.einsum("ncm,nmd->ncd", inside, frames)).norm(dim=2)
+def _error(exact: Doubles, rounded: Doubles, dtype: torch.dtype, words: np.dtype) -> Doubles:
+    """How far a score of the fast pass can be off. (1 + dim, n, D) twice -> (n,)
+
+    Let r bound the relative error of one rounding (2^-8 for bf16), and let p', B', u' be what is multiplied instead of p, B, u.
+    s = D 2^-23 is twice what a sum of D products in float32 can err by, relative to the norms, which covers the few float32
+    operations that follow as well. Then p·u errs by at most
+
+        t = |p' − p| + |p| (|u' − u| + s)          and then by r |p·u| as it is rounded,
+
+    the vector B u by at most
+
+        y = |B' − B| + |u' − u| + √dim s           and then by r |B u|,
+
+    and the score 2 p·u + |B u|² by at most
+
+        2 (1 + r) (t + y) + 2 r (|p·u| + |B u|²) + (y + r)²,    where |p·u| + |B u|² ≤ 1 + |p|² / 4, as |p̂·u|² + |B u|² ≤ 1.
+    """
+    r = torch.finfo(dtype).eps / 2
+    word = 0.0 if words == np.uint8 else r  # |u' − u|
+    s = exact.shape[2] * 2.0**-23
+    foot = np.linalg.norm(exact[0], axis=1)  # (n,) |p|
+    off = rounded - exact
+    t = np.linalg.norm(off[0], axis=1) + foot * (word + s)
+    y = np.linalg.norm(off[1:].transpose(1, 0, 2), ord=2, axis=(1, 2)) + word + (len(off) - 1) ** 0.5 * s
+    return 2 * (1 + r) * (t + y) + 2 * r * (1 + foot**2 / 4) + (y + r) ** 2
+
+
+def _decide(
+    feet: Doubles, frames: Doubles, words: Bytes | Floats, rows: Indices, near: Indices, count: int
+) -> tuple[Indices, Doubles]:
+    """Of the possible words of each subspace the nearest. (n, D), (n, dim, D), (K, D), (P,), (P,) -> (n, count) twice"""
+    distances = np.empty(len(rows))
+    for start in range(0, len(rows), PAIRS):
+        part = slice(start, start + PAIRS)
+        offsets = unit_rows(words[near[part]]) - feet[rows[part]]  # (PAIRS, D) float64
+        distances[part] = np.linalg.norm(_outside(offsets, frames[rows[part]]), axis=1)
+    order = np.lexsort((near, distances, rows))
+    first = np.searchsorted(rows[order], np.arange(len(feet)))
+    chosen = order[first[:, None] + np.arange(count)]  # (n, count)
+    return near[chosen], distances[chosen]

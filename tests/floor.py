@@ -1,0 +1,21 @@
+"""The floor of a search's time: its matrix product and nothing else."""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from bench.kernels.search import BLOCK, unit_rows
+
+
+def bare_product(rows: int, words: np.ndarray, dtype: torch.dtype) -> Callable[[], None]:
+    """Multiplies (rows, D) numbers by (K, D) words in blocks that stay in the cache."""
+    factor = torch.randn(rows, words.shape[1]).to(dtype)
+    blocks = torch.from_numpy(unit_rows(words)).to(dtype).split(BLOCK)
+    out = factor.new_empty(rows, BLOCK)
+
+    def multiply() -> None:
+        for block in blocks:
+            torch.mm(factor, block.T, out=out[:, : len(block)])
+
+    return multiply
