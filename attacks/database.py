@@ -2,8 +2,8 @@
 
 Step 1 sorts the words by their distance to D. Step 2 takes the first for the adversarial descriptors â, as many as the defense's
 configuration says: they lie in D but for the float32 of the release, about 1e-7. Step 3 takes the next |V| words. They lie near D
-where D meets real descriptors, at an â or at d; so the |U| of them that are farthest from every â estimate d, by the paper's equation
-for d̂: their mean, weighted by 1 / dist(D, u), projected onto D. Then d̂ is scaled to unit norm, as every descriptor is.
+where D meets real descriptors, at an â or at d; so the |U| of them that are farthest from every â tell of d, by the paper's
+equation for d̂: their mean, weighted by 1 / dist(D, u), projected onto D. Then d̂ is scaled to unit norm, as every descriptor is.
 """
 
 from __future__ import annotations
@@ -35,9 +35,7 @@ class Database(DescriptorAttack):
 
     def __post_init__(self) -> None:
         if not 1 <= self.estimators <= self.neighbours:
-            raise UserError(
-                f"database: estimators must be from 1 to neighbours, got {self.estimators} estimators of {self.neighbours} neighbours"
-            )
+            raise UserError(f"database: estimators must be from 1 to neighbours, {self.neighbours}, got {self.estimators}")
 
     def unsuited(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
         if not isinstance(defense, Lifting):

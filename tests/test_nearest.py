@@ -10,7 +10,7 @@ from bench.kernels.search import unit_rows
 from bench.kernels.subspaces import nearest_to_subspaces
 from bench.plugin import Asset, View
 from bench.public import Public
-from bench.types import Features, Knowledge, Subspaces
+from bench.types import Features, Knowledge
 from defenses.affine import Affine
 
 

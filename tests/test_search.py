@@ -95,7 +95,7 @@ def flat(words: np.ndarray) -> faiss.IndexFlatIP:
 
 
 @speed
-@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=["float32", "bf16"])
 def test_speed_of_the_bare_product(benchmark, many, dtype):
     queries, words = many
     benchmark(bare_product(len(queries), words, dtype))

@@ -199,7 +199,7 @@ def lifted() -> Callable[[int], tuple[Subspaces, np.ndarray]]:
 
 
 @by_dim
-@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=["float32", "bf16"])
 def test_speed_of_the_bare_product(benchmark, lifted, dim, dtype):
     release, words = lifted(dim)
     benchmark(bare_product(len(release) * (dim + 1), words, dtype))

@@ -1,11 +1,11 @@
 """The words nearest to affine subspaces: a fast pass finds which words they can be, float64 decides among them.
 
-With p the point of D nearest to zero and B its orthonormal basis, a unit word u has dist(D, u)² = 1 + |p|² − s and s = 2 p·u + |B u|².
-So nearly all of the work is one matrix product, 2·N·(dim + 1)·K·D operations: the floor.
+With p the point of D nearest to zero and B its orthonormal basis, a unit word u has dist(D, u)² = 1 + |p|² − s, where its score
+s = 2 p·u + |B u|². So nearly all of the work is one matrix product, 2·N·(dim + 1)·K·D operations: the floor.
 
 Why no near word is lost. The fast pass rounds p, B and each product, so that its score is off by at most E (`_error`). Of the
-`count` words that it scores highest, the lowest has s' and so a true score of at least s' − E; a word that it scores below s' − 2 E
-has a true score below that. Every other word is handed on. Zero is no special case, and is told from small by float64 alone.
+`count` words that it scores highest, the lowest has s' and so a true score of at least s' − E; a word that it scores below
+s' − 2 E has a true score below that. Every other word is handed on. Zero is no special case; float64 tells it from small.
 """
 
 from __future__ import annotations
