@@ -28,8 +28,8 @@ from bench.kernels.subspaces import nearest_to_subspaces
 from bench.plugin import DescriptorAttack, Lifting, View
 from bench.progress import Progress
 from bench.public import Public
-from bench.tasks.reconstruction import view
-from bench.types import Features, Floats, Knowledge, Subspaces
+from bench.tasks.reconstruction import offered
+from bench.types import Floats, Knowledge, Subspaces
 from metrics.angle import Angle
 from metrics.recovered import Recovered
 
@@ -109,25 +109,17 @@ def measure(tuning: Tuning, photos: Sequence[Path], keypoints: int) -> np.ndarra
     values = np.empty((len(defenses), len(settings), len(photos), len(METRICS)))
     with Progress(tuning.attack.name(), len(photos)) as progress:
         for number, path in enumerate(photos):
-            secret = some(extractor.extract(photographs.read(path).pixels, path), keypoints, np.random.default_rng(number))
+            secret = extractor.extract(photographs.read(path).pixels, path)
+            rng = np.random.default_rng(number)
+            secret = secret.take(np.sort(rng.choice(len(secret), min(keypoints, len(secret)), replace=False)))
             for point, defense in enumerate(defenses):
                 release = defense.protect(secret, public, np.random.default_rng([number, point]))
-                seen = view(settings[0], defense, release, extractor, public)
+                known = offered(settings[0], defense, public)
+                seen = View(release=release, defense=defense, extractor=extractor, knowledge=known)
                 for setting, found in enumerate(tuning.recover(seen, settings)):
                     values[point, setting, number] = [metric(secret.descriptors, found) for metric in METRICS]
             progress.advance()
     return values
-
-
-def some(features: Features, count: int, rng: np.random.Generator) -> Features:
-    """That many of the keypoints, or all if there are fewer."""
-    chosen = np.sort(rng.choice(len(features), min(count, len(features)), replace=False))
-    return Features(
-        keypoints=features.keypoints[chosen],
-        descriptors=features.descriptors[chosen],
-        codes=None if features.codes is None else features.codes[chosen],
-        size=features.size,
-    )
 
 
 def report(tuning: Tuning, measured: np.ndarray, keypoints: int) -> str:
