@@ -49,5 +49,5 @@ def draw(curve: list[dict[str, Any]]) -> Figure:
     axes.set_xticks(numbers)
     axes.set_ylim(0, 1.04)
     axes.grid(alpha=0.3)
-    axes.legend(fontsize=8, loc="center right")
+    axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.55, 0.93))
     return figure

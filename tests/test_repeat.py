@@ -45,9 +45,9 @@ def errors(found: np.ndarray) -> np.ndarray:
 # ---- subspaces
 
 
-@pytest.fixture
-def affine(tmp_path):
-    database = small_dictionary(tmp_path, words=16_000)
+@pytest.fixture(scope="module")
+def affine(tmp_path_factory):
+    database = small_dictionary(tmp_path_factory.mktemp("database"), words=16_000)
     return lambda dim: Affine(dim=dim, database=database)
 
 
@@ -97,9 +97,7 @@ def test_neither_basis_nor_order_matters(affine, rng):
     np.testing.assert_allclose(recovered(affine(4), turned), expected, atol=1e-5)
     np.testing.assert_allclose(recovered(affine(4), releases[::-1]), expected, atol=1e-5)
     order = rng.permutation(len(SECRET))
-    moved = [
-        dataclasses.replace(r, keypoints=r.keypoints[order], origins=r.origins[order], bases=r.bases[order]) for r in releases
-    ]
+    moved = [dataclasses.replace(one, origins=one.origins[order], bases=one.bases[order]) for one in releases]
     np.testing.assert_allclose(recovered(affine(4), moved), expected[order], atol=1e-6)
 
 
