@@ -1,0 +1,64 @@
+"""Context: which candidate of a keypoint is the true word, told by the candidates around it. In no paper that we follow.
+
+Wrong words are drawn from the whole dictionary alike, true ones fit what the photograph shows there. A network that was trained
+on public photographs (`surroundings/`) gives each candidate its posterior chance, and the chance that it is none of them, which
+the defense's configuration sets beforehand, as well as the descriptor to be expected then.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+
+from attacks.inversion.weights import misfit
+from attacks.surroundings.scenes import prior_odds, scene
+from attacks.surroundings.weights import Network, load
+from bench.plugin import Asset, Defense, DescriptorAttack, Extractor, View
+from bench.public import ASSETS, Public
+from bench.types import Floats, Knowledge, WordSets
+
+
+@dataclass(frozen=True, kw_only=True)
+class Context(DescriptorAttack):
+    """Weighs the candidates of each keypoint by those of the keypoints around it."""
+
+    accepts = (WordSets,)
+    needs = frozenset({Knowledge.TRAINING_IMAGES})
+
+    estimate: Literal["mean", "word"] = "mean"  # of the posterior, or the candidate that is likeliest
+    weights: Asset = Asset("shipped")
+
+    def unsuited(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
+        reason = misfit(self._network().meta, defense, extractor, public)
+        return reason and f"no adapted attacker: {self._path().name} was {reason}"
+
+    def assets(self, defense: Defense, extractor: Extractor, public: Public) -> Mapping[str, str]:
+        return {"weights": self._network().digest}
+
+    def recover(self, view: View, rng: np.random.Generator) -> Floats:
+        release = view.release
+        if not isinstance(release, WordSets):
+            raise TypeError(f"context attacks WordSets, got {type(release).__name__}")
+        module = self._network().module
+        odds = prior_odds(view.defense, view.know(Knowledge.TRAINING_IMAGES), release.subset_size)
+        seen = scene([release], [odds], module.shape.neighbours)
+        device = next(module.parameters()).device
+        with torch.inference_mode():
+            belief = module(seen.to(device))
+        if self.estimate == "word":
+            return release.candidates[np.arange(len(release)), belief.odds.argmax(dim=1).cpu().numpy()]
+        return belief.mean(seen.candidates.to(device)).cpu().numpy()
+
+    def _path(self) -> Path:
+        return ASSETS / "context.safetensors" if self.weights == "shipped" else Path(self.weights)
+
+    def _network(self) -> Network:
+        return load(self._path())
+
+
+PLUGIN = Context
