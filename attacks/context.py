@@ -16,11 +16,14 @@ import numpy as np
 import torch
 
 from attacks.inversion.weights import misfit
+from attacks.surroundings.network import Belief
 from attacks.surroundings.scenes import prior_odds, scene
 from attacks.surroundings.weights import Network, load
 from bench.plugin import Asset, Defense, DescriptorAttack, Extractor, View
 from bench.public import ASSETS, Public
 from bench.types import Floats, Knowledge, WordSets
+
+ESTIMATES = {"told": Belief.told, "mean": Belief.mean, "word": Belief.word}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +33,8 @@ class Context(DescriptorAttack):
     accepts = (WordSets,)
     needs = frozenset({Knowledge.TRAINING_IMAGES})
 
-    estimate: Literal["mean", "word"] = "mean"  # of the posterior, or the candidate that is likeliest
+    # The posterior mean if the true word was told; that over none of them, too; or the likeliest candidate.
+    estimate: Literal["told", "mean", "word"] = "told"
     weights: Asset = Asset("shipped")
 
     def unsuited(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
@@ -47,12 +51,10 @@ class Context(DescriptorAttack):
         module = self._network().module
         odds = prior_odds(view.defense, view.know(Knowledge.TRAINING_IMAGES), release.subset_size)
         seen = scene([release], [odds], module.shape.neighbours)
-        device = next(module.parameters()).device
         with torch.inference_mode():
-            belief = module(seen.to(device))
-        if self.estimate == "word":
-            return release.candidates[np.arange(len(release)), belief.odds.argmax(dim=1).cpu().numpy()]
-        return belief.mean(seen.candidates.to(device)).cpu().numpy()
+            seen = seen.to(next(module.parameters()).device)
+            found = ESTIMATES[self.estimate](module(seen), seen.candidates)
+        return found.cpu().numpy()
 
     def _path(self) -> Path:
         return ASSETS / "context.safetensors" if self.weights == "shipped" else Path(self.weights)

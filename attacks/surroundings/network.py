@@ -15,6 +15,7 @@ around. They add to the odds of what fits, and tell the descriptor that is to be
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -72,6 +73,14 @@ class Belief:
         share = self.logits.softmax(dim=1)  # (P, m + 1)
         mixed = torch.einsum("pm,pmd->pd", share[:, :-1], candidates) + share[:, -1:] * self.expected
         return nnf.normalize(mixed, dim=1)
+
+    def told(self, candidates: Tensor) -> Tensor:
+        """The posterior mean if the true word is among the candidates, scaled to unit norm. (P, m, D) -> (P, D)"""
+        return nnf.normalize(torch.einsum("pm,pmd->pd", self.odds.softmax(dim=1), candidates), dim=1)
+
+    def word(self, candidates: Tensor) -> Tensor:
+        """The likeliest candidate. (P, m, D) -> (P, D)"""
+        return candidates[torch.arange(len(candidates), device=candidates.device), self.odds.argmax(dim=1)]
 
 
 class Surroundings(nn.Module):
@@ -173,7 +182,7 @@ def describe(offsets: Tensor) -> Tensor:
     length = offsets.norm(dim=-1, keepdim=True)
     direction = offsets / length.clamp_min(0.5)
     x, y = direction.split(1, dim=-1)
-    phase = torch.log1p(length.clamp_max(FARTHEST)) / torch.log1p(torch.tensor(FARTHEST)) * torch.pi
+    phase = torch.log1p(length.clamp_max(FARTHEST)) * (math.pi / math.log1p(FARTHEST))
     sines = [torch.sin(phase * frequency) for frequency in FREQUENCIES]
     cosines = [torch.cos(phase * frequency) for frequency in FREQUENCIES]
     return torch.cat([direction, x * x - y * y, x * y, *sines, *cosines, *[direction * sine for sine in sines]], dim=-1)
