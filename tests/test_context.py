@@ -202,7 +202,7 @@ def secret():
     return Sift().extract(photographs.read(photographs.builtin()[0].path).pixels)
 
 
-def recovered(release: WordSets, defense: LDP, public: Public, estimate: str = "told") -> np.ndarray:
+def recovered(release: WordSets, defense: LDP, public: Public, estimate: str = "mean") -> np.ndarray:
     view = View(release=release, defense=defense, extractor=Sift(), knowledge={Knowledge.TRAINING_IMAGES: lambda: public})
     return Context(estimate=estimate).recover(view, np.random.default_rng(0))
 

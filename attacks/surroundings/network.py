@@ -74,10 +74,6 @@ class Belief:
         mixed = torch.einsum("pm,pmd->pd", share[:, :-1], candidates) + share[:, -1:] * self.expected
         return nnf.normalize(mixed, dim=1)
 
-    def told(self, candidates: Tensor) -> Tensor:
-        """The posterior mean if the true word is among the candidates, scaled to unit norm. (P, m, D) -> (P, D)"""
-        return nnf.normalize(torch.einsum("pm,pmd->pd", self.odds.softmax(dim=1), candidates), dim=1)
-
     def word(self, candidates: Tensor) -> Tensor:
         """The likeliest candidate. (P, m, D) -> (P, D)"""
         return candidates[torch.arange(len(candidates), device=candidates.device), self.odds.argmax(dim=1)]
