@@ -22,6 +22,7 @@ bench: .venv/ready-to-test # speed, as ratios within one run
 
 assets: .venv/ready # hours: rebuilds the dictionaries and networks that are shipped
 	$(BIN)/python tools/make_assets.py --data $(DATA) --work work/assets
+	$(BIN)/python tools/train_context.py --data $(DATA) --work work/assets
 
 .venv/ready: pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.11")'

@@ -311,7 +311,7 @@ def test_crops_keep_what_lies_within(sources, rng):
     view = max(collect(sources[:1], Sift()), key=lambda view: len(view.pixels))
     place = {tuple(code): number for number, code in enumerate(view.features.codes)}
     for _ in range(10):
-        pixels, features = data._random_crop(view, rng)
+        pixels, features = data.random_crop(view, rng)
         offsets = view.features.keypoints[[place[tuple(code)] for code in features.codes]] - features.keypoints
         left, top = np.rint(np.median(offsets, axis=0)).astype(int)
         assert np.array_equal(pixels, view.pixels[top : top + 256, left : left + 256])

@@ -49,7 +49,7 @@ class Examples:
     def draw(self, rng: np.random.Generator) -> Example:
         """A random crop of a random view under random served settings."""
         view = self.views[int(rng.integers(len(self.views)))]
-        pixels, secret = _random_crop(view, rng)
+        pixels, secret = random_crop(view, rng)
         return self._release(view.photograph, pixels, secret, rng)
 
     def whole(self, view: PhotographView, rng: np.random.Generator) -> Example:
@@ -64,7 +64,7 @@ class Examples:
         return Example(pixels, defense.protect(secret, self.public, rng), condition(defense, self.served))
 
 
-def _random_crop(view: PhotographView, rng: np.random.Generator) -> tuple[Bytes, Features]:
+def random_crop(view: PhotographView, rng: np.random.Generator) -> tuple[Bytes, Features]:
     """A 256 x 256 window that holds at least one keypoint."""
     room = len(view.pixels) - SIDE
     while True:

@@ -1,0 +1,73 @@
+"""Trains the network of the attack `context` and writes `bench/assets/context.safetensors`. About 20 minutes on one idle core.
+
+It learns from the third of the photographs of `train/` that the shipped dictionary was not made from (`make_assets.part`): a
+photograph that helped to make a dictionary quantises to nearly itself.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from make_assets import part
+
+from attacks.inversion.data import fitting_dictionaries, quantisation_error, quantise
+from attacks.inversion.train import Training, check_quantisation
+from attacks.inversion.weights import describe
+from attacks.surroundings.network import Shape
+from attacks.surroundings.train import fit, lessons, validate
+from attacks.surroundings.weights import save
+from bench.datasets.photographs import SIDE, folder
+from bench.features.sift import Sift
+from bench.features.views import PhotographView, collect
+from bench.public import ASSETS, Public
+from defenses.ldp import LDP
+
+SERVED = {field: LDP.serves[field] for field in ("epsilon", "subset_size")}
+TRIED = [LDP(epsilon=epsilon, subset_size=size) for epsilon, size in ((8, 2), (10, 1), (10, 2), (10, 4), (12, 2), (16, 2))]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--work", type=Path, required=True)
+    parser.add_argument("--out", type=Path, default=ASSETS / "context.safetensors")
+    parser.add_argument("--steps", type=int, default=2000, help="of two crops each")
+    args = parser.parse_args()
+    folders = part(args.data, args.work / "photographs")
+    views, unseen = (collect(folder(folders[name]), Sift())[::2] for name in ("2", "tune"))  # not the mirrored ones
+    train(views, [view for view in unseen if len(view.pixels) == SIDE], args.out, Training(steps=args.steps, batch=2))
+
+
+def train(views: list[PhotographView], unseen: list[PhotographView], out: Path, training: Training) -> None:
+    defense, shape, public = LDP(), Shape(), Public()
+    every = [*views, *unseen]
+    dictionaries = fitting_dictionaries({view.photograph for view in every}, [defense.dictionary], public)
+    public = Public(quantise(every, dictionaries, public))
+    errors = {
+        "training": quantisation_error(views, dictionaries, public),
+        "validation": quantisation_error(unseen, dictionaries, public),
+    }
+    check_quantisation(**errors)
+    draw = lessons(views, defense, SERVED, "subset_size", public, shape.neighbours, training.batch)
+    module, secrets = fit(shape, draw, training), [view.features for view in unseen]
+    meta = {
+        **describe(defense, dict(SERVED), Sift(), Public()),
+        "photographs": sorted({view.photograph for view in views}),
+        "crops": training.steps * training.batch,
+        "batch": training.batch,
+        "rate": training.rate,
+        "seed": training.seed,
+        "quantisation_error": errors,
+        "validation": [
+            {"epsilon": tried.epsilon, "subset_size": tried.subset_size, **validate(module, secrets, tried, public)}
+            for tried in TRIED
+        ],
+    }
+    save(out, module, meta)
+    for row in meta["validation"]:
+        print({name: round(value, 4) for name, value in row.items()})
+
+
+if __name__ == "__main__":
+    main()
