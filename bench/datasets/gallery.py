@@ -1,0 +1,224 @@
+"""The gallery: a made-up building that is rendered here, so its poses are exact and in metres, and nothing need be fetched.
+
+A courtyard and four rooms, hung with pictures (photographs that the libraries carry, and painted by chance), furnished, lit with
+shadows; references are taken on walks by day, queries beside those walks by day and by night, with people before them who are in
+no other image's map. Everything is a function of the fields of `Gallery`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import Literal
+
+import numpy as np
+import pycolmap
+
+from bench.datasets.scene import Condition, Mask, Pixels, Scene, SceneImage
+from bench.errors import UserError
+from bench.rendering import people, walks
+from bench.rendering.building import Building, build
+from bench.rendering.mipmap import Texture
+from bench.rendering.people import Person
+from bench.rendering.raster import Drawing, Eye, Quad, draw
+from bench.rendering.rooms import ROOMS, UP
+from bench.rendering.sensor import Sensor, expose
+from bench.rendering.walks import Station
+from bench.types import Bytes, Floats
+
+FIELD_OF_VIEW = np.radians(63.0)  # of the references, from left to right
+QUERY_ZOOMS = (0.92, 1.0, 1.15)  # focal lengths of the phones that queries are taken with, relative to the references'
+CAST = 12  # people to choose from
+
+Kind = Literal["reference", "query"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gallery:
+    """All that decides what the gallery looks like."""
+
+    seed: int = 0
+    views: int = 300  # reference images
+    queries: int = 300
+    night: float = 1 / 3  # share of the queries
+    width: int = 640  # pixels
+    height: int = 480
+    rooms: int = len(ROOMS)  # how many of them are visited, the courtyard first
+    repeats: float = 0.15  # share of pictures that hang elsewhere as well
+    bare: float = 0.15  # share of places on the walls left empty
+    viewpoint: float = 1.0  # how far queries are from the walks: 1 is about 0.7 m and 20 degrees
+    people: float = 1.5  # in an image, on average
+    blur: float = 1.0  # of queries; 1 is about a pixel
+    noise: float = 1.0  # of queries; 1 is a good sensor's
+    detail: float = 1.0  # of textures; 1 is about a texel a pixel from 1.5 m away
+
+    def __post_init__(self) -> None:
+        if self.views < 1 or self.queries < 0 or not 1 <= self.rooms <= len(ROOMS):
+            raise UserError(f"gallery: at least one view, no negative number of queries, and 1 to {len(ROOMS)} rooms")
+        if min(self.width, self.height) < 32 or self.detail <= 0:
+            raise UserError("gallery: images are at least 32 pixels wide and high, and detail is positive")
+        if not all(0 <= share <= 1 for share in (self.night, self.repeats, self.bare)):
+            raise UserError("gallery: night, repeats and bare are shares from 0 to 1")
+        if min(self.viewpoint, self.people, self.blur, self.noise) < 0:
+            raise UserError("gallery: viewpoint, people, blur and noise cannot be negative")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Shot:
+    """One rendered image with all that is known of it."""
+
+    pixels: Bytes  # (H, W, 3)
+    foreground: Mask  # (H, W)
+    depth: Floats  # (H, W) metres along the optical axis; infinite in the sky
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rendered(Pixels):
+    """An image of the gallery, rendered when it is read."""
+
+    gallery: Gallery
+    kind: Kind
+    index: int
+
+    def read(self) -> Bytes:
+        return shot(self.gallery, self.kind, self.index).pixels
+
+    def foreground(self) -> Mask:
+        return shot(self.gallery, self.kind, self.index).foreground
+
+
+def scene(gallery: Gallery) -> Scene:
+    """The gallery as a scene, for whatever takes one."""
+    model = _model(gallery)
+    return Scene(
+        name="gallery",
+        references=tuple(_image(model, "reference", index) for index in range(gallery.views)),
+        queries=tuple(_image(model, "query", index) for index in range(gallery.queries)),
+    )
+
+
+@lru_cache(maxsize=16)  # read and foreground ask for the same
+def shot(gallery: Gallery, kind: Kind, index: int) -> Shot:
+    """Render one image."""
+    model = _model(gallery)
+    taken = model.taken[kind][index]
+    rng = np.random.default_rng([gallery.seed, 7, kind == "query", index])
+    eye = _eye(taken)
+    night = taken.condition == "night"
+    crowd = _crowd(rng, model, taken, eye)
+    drawing = draw(eye, model.building.night if night else model.building.day, crowd, lambda rays: model.building.sky_at(rays, night))
+    return Shot(pixels=expose(drawing.light, _sensor(gallery, kind, night), rng), foreground=drawing.foreground, depth=drawing.depth)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Taken:
+    """When, where and with what an image was taken."""
+
+    name: str
+    station: Station
+    camera: pycolmap.Camera
+    condition: Condition
+
+
+@dataclass(frozen=True, eq=False)
+class _Model:
+    """What all images of one gallery share."""
+
+    gallery: Gallery
+
+    @cached_property
+    def building(self) -> Building:
+        g = self.gallery
+        return build(g.seed, repeats=g.repeats, bare=g.bare, detail=g.detail)
+
+    @cached_property
+    def cast(self) -> dict[Kind, list[Person]]:
+        rngs = (np.random.default_rng([self.gallery.seed, 8, number]) for number in range(2))
+        return {"reference": people.of_map(next(rngs), CAST), "query": people.of_queries(next(rngs), CAST)}
+
+    @cached_property
+    def taken(self) -> dict[Kind, list[_Taken]]:
+        g = self.gallery
+        rooms = ROOMS[: g.rooms]
+        by_day = g.queries - round(g.night * g.queries)
+        references = [
+            _Taken(name=f"db/{room.name}-{lap}-{number:04d}.png", station=station, camera=_camera(g, 1.0), condition="day")
+            for number, (room, lap, station) in enumerate(walks.references(rooms, g.views, self.building, g.seed))
+        ]
+        queries = []
+        for number, (_, station) in enumerate(walks.queries(rooms, g.queries, self.building, g.seed, g.viewpoint)):
+            condition: Condition = "day" if number < by_day else "night"
+            phone = int(np.random.default_rng([g.seed, 9, number]).integers(len(QUERY_ZOOMS)))
+            name = f"query/{condition}/phone{phone}/{condition}-{number:04d}.png"
+            queries.append(_Taken(name=name, station=station, camera=_camera(g, QUERY_ZOOMS[phone]), condition=condition))
+        return {"reference": references, "query": queries}
+
+
+@lru_cache(maxsize=2)  # textures are large
+def _model(gallery: Gallery) -> _Model:
+    return _Model(gallery)
+
+
+def _camera(gallery: Gallery, zoom: float) -> pycolmap.Camera:
+    focal = zoom * gallery.width / 2 / np.tan(FIELD_OF_VIEW / 2)
+    return pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", round(float(focal), 3), gallery.width, gallery.height)
+
+
+def _image(model: _Model, kind: Kind, index: int) -> SceneImage:
+    taken = model.taken[kind][index]
+    rotation, centre = taken.station.rotation, taken.station.centre
+    return SceneImage(
+        name=taken.name,
+        camera=taken.camera,
+        cam_from_world=pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ centre),
+        condition=taken.condition,
+        pixels=Rendered(gallery=model.gallery, kind=kind, index=index),
+    )
+
+
+def _eye(taken: _Taken) -> Eye:
+    rotation = taken.station.rotation
+    return Eye(
+        calibration=taken.camera.calibration_matrix(),
+        rotation=rotation,
+        translation=-rotation @ taken.station.centre,
+        size=(taken.camera.width, taken.camera.height),
+    )
+
+
+def _sensor(gallery: Gallery, kind: Kind, night: bool) -> Sensor:
+    if kind == "reference":
+        return Sensor(defocus=0.4, shake=0.0, noise=1.0, cast=0.02)
+    blur = gallery.blur * (1.3 if night else 1.0)
+    return Sensor(defocus=0.55 * blur, shake=1.2 * blur, noise=1.5 * gallery.noise, cast=0.04)
+
+
+def _crowd(rng: np.random.Generator, model: _Model, taken: _Taken, eye: Eye) -> list[Quad]:
+    """People who happen to stand in view, turned towards the camera."""
+    station, cast = taken.station, model.cast["query" if taken.name.startswith("query") else "reference"]
+    half = np.arctan(eye.size[0] / 2 / eye.calibration[0, 0])
+    crowd = []
+    for _ in range(rng.poisson(model.gallery.people)):
+        person = cast[rng.integers(len(cast))]
+        bearing, away = station.heading + rng.uniform(-0.9, 0.9) * half, rng.uniform(1.4, 5.5)
+        feet = station.centre * [1, 1, 0] + away * np.array([np.cos(bearing), np.sin(bearing), 0.0])
+        if model.building.free(feet[0], feet[1], 0.3):
+            crowd.append(_figure(person, feet, station, model.building, taken.condition == "night"))
+    return crowd
+
+
+def _figure(person: Person, feet: np.ndarray, station: Station, building: Building, night: bool) -> Quad:
+    towards = station.centre * [1, 1, 0] - feet
+    towards = towards / np.linalg.norm(towards)
+    across = np.cross(UP, towards) * person.wide  # to the camera's right
+    points = feet + np.array([[0.6], [1.4]]) * UP + 0.05 * towards
+    light = building.falls(points.astype(np.float32), np.broadcast_to(towards, points.shape).astype(np.float32), night)
+    texture = Texture.of(person.pixels)
+    return Quad(
+        corner=feet + person.tall * UP - across / 2,
+        across=across,
+        down=-UP * person.tall,
+        texture=lambda: texture,
+        light=light[::-1, None],
+        opacity=person.opacity,
+    )

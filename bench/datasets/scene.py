@@ -1,0 +1,73 @@
+"""A place that was photographed: reference images whose poses are known, and queries to be localized or reconstructed.
+
+One convention everywhere, COLMAP's. A pose is `cam_from_world`: x_camera = R x_world + t; the camera's x goes right, its y down,
+its z forward, and its centre is -Rᵀt. In an image the centre of the top-left pixel is (0.5, 0.5). Quaternions in files are written
+w x y z (pycolmap's own arrays are x y z w).
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.datasets.photographs import decode
+from bench.errors import UnitError
+from bench.types import Bytes
+
+if TYPE_CHECKING:
+    import pycolmap
+
+Condition = Literal["day", "night"]
+Mask = NDArray[np.bool_]
+
+
+class Pixels(ABC):
+    """Where an image's pixels come from; nothing is read before it is asked for. Can be pickled, for other processes."""
+
+    @abstractmethod
+    def read(self) -> Bytes:
+        """(H, W, 3) uint8 RGB, of the size that the image's camera says."""
+
+    def foreground(self) -> Mask | None:
+        """(H, W), True where something hides the scene that moves; None where that is not known."""
+        return None
+
+
+@dataclass(frozen=True, kw_only=True)
+class File(Pixels):
+    """A photograph on disk, as it is stored: no EXIF rotation, since intrinsics are of the stored image."""
+
+    path: Path
+    size: tuple[int, int]  # width, height
+
+    def read(self) -> Bytes:
+        pixels = decode(self.path, upright=False)[0]
+        if pixels.size != self.size:
+            raise UnitError(f"{self.path}: {pixels.size[0]} x {pixels.size[1]} pixels; its camera has {self.size[0]} x {self.size[1]}")
+        return np.array(pixels)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SceneImage:
+    """One image of a scene."""
+
+    name: str  # as lists and models call it, with / between folders
+    camera: pycolmap.Camera  # intrinsics; its id means nothing
+    cam_from_world: pycolmap.Rigid3d | None  # in the scene's unit of length; None where it is withheld
+    condition: Condition
+    pixels: Pixels
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Scene:
+    """Reference images, each with its pose, and queries."""
+
+    name: str
+    references: tuple[SceneImage, ...]
+    queries: tuple[SceneImage, ...]
+    unit: str = "metre"  # of length, in words
