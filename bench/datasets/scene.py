@@ -21,6 +21,7 @@ from bench.types import Bytes
 
 if TYPE_CHECKING:
     import pycolmap
+    from PIL.Image import Image
 
 Condition = Literal["day", "night"]
 Mask = NDArray[np.bool_]
@@ -40,16 +41,24 @@ class Pixels(ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class File(Pixels):
-    """A photograph on disk, as it is stored: no EXIF rotation, since intrinsics are of the stored image."""
+    """A photograph on disk as it is stored, without EXIF rotation: intrinsics are of the stored image."""
 
     path: Path
-    size: tuple[int, int]  # width, height
+    size: tuple[int, int]  # width, height that the camera says
+    mask: Path | None = None  # an image that is white where the foreground is
 
     def read(self) -> Bytes:
-        pixels = decode(self.path, upright=False)[0]
-        if pixels.size != self.size:
-            raise UnitError(f"{self.path}: {pixels.size[0]} x {pixels.size[1]} pixels; its camera has {self.size[0]} x {self.size[1]}")
-        return np.array(pixels)
+        """Raises UnitError if the file cannot be decoded or is of another size."""
+        return np.array(self._decoded(self.path))
+
+    def foreground(self) -> Mask | None:
+        return None if self.mask is None else np.asarray(self._decoded(self.mask).convert("L")) > 127
+
+    def _decoded(self, path: Path) -> Image:
+        image, _ = decode(path, upright=False)
+        if image.size != self.size:
+            raise UnitError(f"{path}: {image.width} x {image.height} pixels; its camera says {self.size[0]} x {self.size[1]}")
+        return image
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
