@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -22,6 +23,7 @@ from bench.datasets import colmap, lists, nvm
 from bench.datasets.colmap import Reference
 from bench.datasets.scene import Condition, Scene
 from bench.errors import UserError
+from bench.plugin import Dataset
 
 Version = Literal["v1", "v1.1"]
 
@@ -32,6 +34,17 @@ MODELS: Mapping[Version, tuple[str, ...]] = {
 INTRINSICS = "database_intrinsics*.txt"  # beside the NVM
 QUERIES = "{}_time_queries_with_intrinsics*.txt"
 LATER = re.compile(r"v?1[._]1\.txt$")  # how a list of version 1.1 is named
+
+
+@dataclass(frozen=True, kw_only=True)
+class Aachen(Dataset):
+    """Aachen Day-Night as downloaded."""
+
+    path: Path
+    version: Version | None = None  # needed where both are there
+
+    def scene(self) -> Scene:
+        return load(self.path, self.version)
 
 
 def load(root: Path, version: Version | None = None) -> Scene:
@@ -138,3 +151,6 @@ def _queries(root: Path, condition: Condition, version: Version | None) -> Path:
     if len(there) != 1:
         raise UserError(f"{folder / pattern}: cannot tell which of these lists is of version {version}")
     return there[0]
+
+
+PLUGIN = Aachen

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from copy import deepcopy
+from dataclasses import dataclass
 from pathlib import Path
 from typing import get_args
 
@@ -21,8 +22,19 @@ import pycolmap
 from bench.datasets import lists
 from bench.datasets.scene import Condition, File, Scene, SceneImage
 from bench.errors import UserError
+from bench.plugin import Dataset
 
 PARTS = ("cameras", "images", "points3D")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Colmap(Dataset):
+    """A folder with a COLMAP model, its images, and lists of queries."""
+
+    path: Path
+
+    def scene(self) -> Scene:
+        return load(self.path)
 
 
 def load(root: Path) -> Scene:
@@ -81,7 +93,9 @@ def assemble(
         naming file and line, if a list is damaged, an image is missing, a name stands for two images, or a pose belongs to none.
     """
     poses = {} if ground_truth is None else _poses(ground_truth)
-    shown = [_image(name, where, camera, pose, "day", images, masks) for name, (where, camera, pose) in sorted(references.items())]
+    shown = [
+        _image(name, where, camera, pose, "day", images, masks) for name, (where, camera, pose) in sorted(references.items())
+    ]
     asked: dict[str, SceneImage] = {}
     for condition, path in queries.items():
         for query, (line, camera) in lists.read_intrinsics(path).items():
@@ -172,3 +186,6 @@ def _image(
         condition=condition,
         pixels=File(path=path, size=(camera.width, camera.height), mask=mask if mask is not None and mask.is_file() else None),
     )
+
+
+PLUGIN = Colmap

@@ -49,7 +49,9 @@ def _as_aachen(scene: Scene, out: Path) -> Path:
     """Version 1: an NVM model with intrinsics beside it. -> the folder for images"""
     queries = _by_condition(scene)
     if len(queries) != len(get_args(Condition)):
-        raise UserError(f"--layout aachen: needs queries by day and by night; there are some {' and '.join(queries) or 'at no time'}")
+        raise UserError(
+            f"--layout aachen: needs queries by day and by night; there are some {' and '.join(queries) or 'at no time'}"
+        )
     models = out / "3D-models"
     nvm.write(models / "aachen_cvpr2018_db.nvm", {image.name: (image.camera, image.cam_from_world) for image in scene.references})
     lists.write_intrinsics(models / "database_intrinsics.txt", {image.name: image.camera for image in scene.references})

@@ -7,22 +7,26 @@ no other image's map. Everything is a function of the fields of `Gallery`.
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cache, cached_property, lru_cache
+from importlib.metadata import version
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import pycolmap
 
+import bench.rendering
 from bench.datasets.scene import Condition, Mask, Pixels, Scene, SceneImage
 from bench.errors import UserError
-from bench.rendering import people, walks
+from bench.plugin import Dataset
+from bench.rendering import crowd, cutouts, walks
 from bench.rendering.building import Building, build
-from bench.rendering.mipmap import Texture
-from bench.rendering.people import Person
-from bench.rendering.raster import Drawing, Eye, Quad, draw
-from bench.rendering.rooms import ROOMS, UP
-from bench.rendering.sensor import Sensor, expose
+from bench.rendering.cutouts import Person
+from bench.rendering.raster import Eye, draw
+from bench.rendering.rooms import ROOMS
+from bench.rendering.sensor import Sensor, expose, metered
 from bench.rendering.walks import Station
 from bench.types import Bytes, Floats
 
@@ -34,8 +38,8 @@ Kind = Literal["reference", "query"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Gallery:
-    """All that decides what the gallery looks like."""
+class Gallery(Dataset):
+    """A made-up building with pictures and people in it, rendered here; poses are exact and in metres."""
 
     seed: int = 0
     views: int = 300  # reference images
@@ -44,7 +48,7 @@ class Gallery:
     width: int = 640  # pixels
     height: int = 480
     rooms: int = len(ROOMS)  # how many of them are visited, the courtyard first
-    repeats: float = 0.15  # share of pictures that hang elsewhere as well
+    repeats: float = 0.1  # share of pictures that hang elsewhere as well
     bare: float = 0.15  # share of places on the walls left empty
     viewpoint: float = 1.0  # how far queries are from the walks: 1 is about 0.7 m and 20 degrees
     people: float = 1.5  # in an image, on average
@@ -53,14 +57,22 @@ class Gallery:
     detail: float = 1.0  # of textures; 1 is about a texel a pixel from 1.5 m away
 
     def __post_init__(self) -> None:
-        if self.views < 1 or self.queries < 0 or not 1 <= self.rooms <= len(ROOMS):
-            raise UserError(f"gallery: at least one view, no negative number of queries, and 1 to {len(ROOMS)} rooms")
-        if min(self.width, self.height) < 32 or self.detail <= 0:
-            raise UserError("gallery: images are at least 32 pixels wide and high, and detail is positive")
+        if self.views < 1 or min(self.queries, self.seed) < 0 or not 1 <= self.rooms <= len(ROOMS):
+            raise UserError(f"gallery: at least one view, neither queries nor seed negative, and 1 to {len(ROOMS)} rooms")
+        if min(self.width, self.height) < 32 or not 0 < self.detail <= 4:
+            raise UserError("gallery: images are at least 32 pixels wide and high, and detail is above 0 and at most 4")
         if not all(0 <= share <= 1 for share in (self.night, self.repeats, self.bare)):
             raise UserError("gallery: night, repeats and bare are shares from 0 to 1")
-        if min(self.viewpoint, self.people, self.blur, self.noise) < 0:
-            raise UserError("gallery: viewpoint, people, blur and noise cannot be negative")
+        if not all(0 <= amount < np.inf for amount in (self.viewpoint, self.people, self.blur, self.noise)):
+            raise UserError("gallery: viewpoint, people, blur and noise are finite and not negative")
+
+    def scene(self) -> Scene:
+        model = _model(self)
+        return Scene(
+            name="gallery",
+            references=tuple(_image(model, "reference", index) for index in range(self.views)),
+            queries=tuple(_image(model, "query", index) for index in range(self.queries)),
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -80,6 +92,9 @@ class Rendered(Pixels):
     kind: Kind
     index: int
 
+    def content_hash(self) -> str:
+        return "sha256:" + hashlib.sha256(f"{_renderer()} {self}".encode()).hexdigest()
+
     def read(self) -> Bytes:
         return shot(self.gallery, self.kind, self.index).pixels
 
@@ -87,27 +102,28 @@ class Rendered(Pixels):
         return shot(self.gallery, self.kind, self.index).foreground
 
 
-def scene(gallery: Gallery) -> Scene:
-    """The gallery as a scene, for whatever takes one."""
-    model = _model(gallery)
-    return Scene(
-        name="gallery",
-        references=tuple(_image(model, "reference", index) for index in range(gallery.views)),
-        queries=tuple(_image(model, "query", index) for index in range(gallery.queries)),
-    )
-
-
 @lru_cache(maxsize=16)  # read and foreground ask for the same
 def shot(gallery: Gallery, kind: Kind, index: int) -> Shot:
     """Render one image."""
     model = _model(gallery)
     taken = model.taken[kind][index]
-    rng = np.random.default_rng([gallery.seed, 7, kind == "query", index])
-    eye = _eye(taken)
     night = taken.condition == "night"
-    crowd = _crowd(rng, model, taken, eye)
-    drawing = draw(eye, model.building.night if night else model.building.day, crowd, lambda rays: model.building.sky_at(rays, night))
-    return Shot(pixels=expose(drawing.light, _sensor(gallery, kind, night), rng), foreground=drawing.foreground, depth=drawing.depth)
+    building, eye = model.building, _eye(taken)
+    mine = [gallery.seed, 7, int(kind == "query"), index]
+    present = crowd.gather(np.random.default_rng([*mine, 0]), model.cast[kind], gallery.people, eye, building, night)
+    drawing = draw(eye, building.night if night else building.day, present, lambda rays: building.sky_at(rays, night))
+    sensor = _sensor(gallery, kind, night)
+    pixels = expose(drawing.light, sensor, metered(drawing.light), np.random.default_rng([*mine, 1]))
+    return Shot(pixels=pixels, foreground=drawing.foreground, depth=drawing.depth)
+
+
+@cache
+def _renderer() -> str:
+    """Changes whenever the same fields may give other pixels."""
+    files = [*Path(bench.rendering.__path__[0]).glob("*.py"), Path(__file__)]
+    parts = [file.read_text(encoding="utf-8") for file in sorted(files)]
+    parts += [version(library) for library in ("numpy", "opencv-python-headless", "scikit-image", "scikit-learn", "matplotlib")]
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -134,7 +150,7 @@ class _Model:
     @cached_property
     def cast(self) -> dict[Kind, list[Person]]:
         rngs = (np.random.default_rng([self.gallery.seed, 8, number]) for number in range(2))
-        return {"reference": people.of_map(next(rngs), CAST), "query": people.of_queries(next(rngs), CAST)}
+        return {"reference": cutouts.of_map(next(rngs), CAST), "query": cutouts.of_queries(next(rngs), CAST)}
 
     @cached_property
     def taken(self) -> dict[Kind, list[_Taken]]:
@@ -193,32 +209,4 @@ def _sensor(gallery: Gallery, kind: Kind, night: bool) -> Sensor:
     return Sensor(defocus=0.55 * blur, shake=1.2 * blur, noise=1.5 * gallery.noise, cast=0.04)
 
 
-def _crowd(rng: np.random.Generator, model: _Model, taken: _Taken, eye: Eye) -> list[Quad]:
-    """People who happen to stand in view, turned towards the camera."""
-    station, cast = taken.station, model.cast["query" if taken.name.startswith("query") else "reference"]
-    half = np.arctan(eye.size[0] / 2 / eye.calibration[0, 0])
-    crowd = []
-    for _ in range(rng.poisson(model.gallery.people)):
-        person = cast[rng.integers(len(cast))]
-        bearing, away = station.heading + rng.uniform(-0.9, 0.9) * half, rng.uniform(1.4, 5.5)
-        feet = station.centre * [1, 1, 0] + away * np.array([np.cos(bearing), np.sin(bearing), 0.0])
-        if model.building.free(feet[0], feet[1], 0.3):
-            crowd.append(_figure(person, feet, station, model.building, taken.condition == "night"))
-    return crowd
-
-
-def _figure(person: Person, feet: np.ndarray, station: Station, building: Building, night: bool) -> Quad:
-    towards = station.centre * [1, 1, 0] - feet
-    towards = towards / np.linalg.norm(towards)
-    across = np.cross(UP, towards) * person.wide  # to the camera's right
-    points = feet + np.array([[0.6], [1.4]]) * UP + 0.05 * towards
-    light = building.falls(points.astype(np.float32), np.broadcast_to(towards, points.shape).astype(np.float32), night)
-    texture = Texture.of(person.pixels)
-    return Quad(
-        corner=feet + person.tall * UP - across / 2,
-        across=across,
-        down=-UP * person.tall,
-        texture=lambda: texture,
-        light=light[::-1, None],
-        opacity=person.opacity,
-    )
+PLUGIN = Gallery

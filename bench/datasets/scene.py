@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.datasets.photographs import decode
+from bench.datasets.photographs import Source, decode
 from bench.errors import UnitError
 from bench.types import Bytes
 
@@ -29,6 +29,10 @@ Mask = NDArray[np.bool_]
 
 class Pixels(ABC):
     """Where an image's pixels come from; nothing is read before it is asked for. Can be pickled, for other processes."""
+
+    @abstractmethod
+    def content_hash(self) -> str:
+        """What caches and records know the image by; never its name."""
 
     @abstractmethod
     def read(self) -> Bytes:
@@ -46,6 +50,9 @@ class File(Pixels):
     path: Path
     size: tuple[int, int]  # width, height that the camera says
     mask: Path | None = None  # an image that is white where the foreground is
+
+    def content_hash(self) -> str:
+        return Source(self.path.name, self.path).content_hash()
 
     def read(self) -> Bytes:
         """Raises UnitError if the file cannot be decoded or is of another size."""
@@ -80,3 +87,4 @@ class Scene:
     references: tuple[SceneImage, ...]
     queries: tuple[SceneImage, ...]
     unit: str = "metre"  # of length, in words
+    left_out: tuple[str, ...] = ()  # photographs that have no pose, so that nothing could be measured with them

@@ -108,7 +108,9 @@ def _by_day() -> Lighting:
     lamps = tuple(
         Lamp(at=(x, y, room.height - 0.25), colour=(2.2, 2.1, 1.9)) for room in ROOMS if room.roofed for x, y in _lamps(room)
     )
-    return Lighting(lamps=lamps, sun=(1.5, 1.4, 1.2), towards_sun=(-0.45, -0.35, 0.82), sky=(0.75, 0.8, 0.9), bounce=(0.3, 0.3, 0.29))
+    return Lighting(
+        lamps=lamps, sun=(1.5, 1.4, 1.2), towards_sun=(-0.45, -0.35, 0.82), sky=(0.75, 0.8, 0.9), bounce=(0.3, 0.3, 0.29)
+    )
 
 
 def _by_night(rng: np.random.Generator) -> Lighting:
@@ -119,7 +121,9 @@ def _by_night(rng: np.random.Generator) -> Lighting:
         lamps += [
             Lamp(at=(x, y, min(room.height, 3.6) - 0.4), colour=(strength, 0.72 * strength, 0.42 * strength)) for x, y in chosen
         ]
-    return Lighting(lamps=tuple(lamps), sun=(0, 0, 0), towards_sun=(0, 0, 1.0), sky=(0.008, 0.012, 0.024), bounce=(0.016, 0.013, 0.01))
+    return Lighting(
+        lamps=tuple(lamps), sun=(0, 0, 0), towards_sun=(0, 0, 1.0), sky=(0.008, 0.012, 0.024), bounce=(0.016, 0.013, 0.01)
+    )
 
 
 def _lamps(room: Room) -> list[tuple[float, float]]:
@@ -281,7 +285,9 @@ class _Furnisher:
         for item in _choose(rng, (INDOORS, INDOORS[::-1])) if room.roofed else OUTDOORS:
             for _ in range(40):
                 x, y = rng.uniform(room.west, room.east), rng.uniform(room.south, room.north)
-                near = [door for door in DOORS if np.hypot((door.west + door.east) / 2 - x, (door.south + door.north) / 2 - y) < 2.2]
+                near = [
+                    door for door in DOORS if np.hypot((door.west + door.east) / 2 - x, (door.south + door.north) / 2 - y) < 2.2
+                ]
                 if room.holds(x, y, 1.6) and not near and all(other.distance(x, y) > 2 * CLEAR for other in self.standing):
                     getattr(self, item)(np.array([x, y, 0.0]), rng.uniform(0, np.pi))
                     break

@@ -84,7 +84,9 @@ def fall(points: Floats, normals: Floats, occluders: Occluders, lightings: tuple
         sun = np.array(lighting.towards_sun, np.float32)
         total += _from(starts, normals, occluders, np.broadcast_to(sun * 100, points.shape), far=True) * np.float32(lighting.sun)
         for lamp in lighting.lamps:
-            total += _from(starts, normals, occluders, np.array(lamp.at, np.float32) - starts, far=False) * np.float32(lamp.colour)
+            total += _from(starts, normals, occluders, np.array(lamp.at, np.float32) - starts, far=False) * np.float32(
+                lamp.colour
+            )
         found.append(total.astype(np.float32))
     return found
 

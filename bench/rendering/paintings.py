@@ -64,7 +64,7 @@ def strokes(rng: np.random.Generator, size: Size) -> Bytes:
         cv2.polylines(
             canvas, [(path * HUGE).astype(np.int32)], False, colour(palette[rng.integers(9)]), thickness, cv2.LINE_AA, shift=6
         )
-    return _grained(rng, canvas, 9)
+    return _grained(rng, canvas, 4)
 
 
 def landscape(rng: np.random.Generator, size: Size) -> Bytes:
@@ -90,7 +90,7 @@ def landscape(rng: np.random.Generator, size: Size) -> Bytes:
         for _ in range(9):
             at = int(x + rng.normal(0, tall / 6)), int(foot - tall * rng.uniform(0.4, 1.05))
             cv2.ellipse(canvas, at, (int(tall / 7) + 1, int(tall / 10) + 1), rng.uniform(0, 180), 0, 360, shade, -1, cv2.LINE_AA)
-    return _grained(rng, canvas, 7)
+    return _grained(rng, canvas, 3)
 
 
 def blocks(rng: np.random.Generator, size: Size) -> Bytes:
@@ -113,8 +113,10 @@ def blocks(rng: np.random.Generator, size: Size) -> Bytes:
             cv2.rectangle(canvas, (x, y), (x + rw, y + rh), colour(palette[rng.integers(6)]), -1)
         cv2.rectangle(canvas, (x, y), (x + rw, y + rh), (25, 22, 20), line)
         if rng.random() < 0.3:
-            cv2.circle(canvas, (x + rw // 2, y + rh // 2), max(2, min(rw, rh) // 3), colour(palette[rng.integers(6)]), -1, cv2.LINE_AA)
-    return _grained(rng, canvas, 6)
+            cv2.circle(
+                canvas, (x + rw // 2, y + rh // 2), max(2, min(rw, rh) // 3), colour(palette[rng.integers(6)]), -1, cv2.LINE_AA
+            )
+    return _grained(rng, canvas, 3)
 
 
 def _areas(rectangles: list[tuple[int, int, int, int]]) -> np.ndarray:
@@ -130,7 +132,7 @@ def mosaic(rng: np.random.Generator, size: Size) -> Bytes:
     joint = cv2.morphologyEx(number.astype(np.float32), cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)) > 0
     canvas = palette[number] * (1.08 - 0.012 * distance[..., None])
     canvas[joint] = rng.uniform(20, 90)
-    return _grained(rng, pixels(canvas), 5)
+    return _grained(rng, pixels(canvas), 2)
 
 
 def marble(rng: np.random.Generator, size: Size) -> Bytes:
@@ -140,7 +142,7 @@ def marble(rng: np.random.Generator, size: Size) -> Bytes:
     turn = rng.uniform(0, np.pi)
     along = (x * np.cos(turn) + y * np.sin(turn)) / max(size) * rng.uniform(10, 30)
     veins = np.abs(np.sin(along + 2.5 * bent)) ** rng.uniform(0.25, 0.6)
-    return _grained(rng, pixels(ramp(veins, colours(rng, 4, (0.05, 0.5)))), 5)
+    return _grained(rng, pixels(ramp(veins, colours(rng, 4, (0.05, 0.5)))), 2)
 
 
 def poster(rng: np.random.Generator, size: Size) -> Bytes:
@@ -157,7 +159,7 @@ def poster(rng: np.random.Generator, size: Size) -> Bytes:
         ink = palette[rng.integers(1, 5)] * 0.6
         _write(rng, canvas, (int(w * 0.05), line), tall, int(w * 0.9), ink)
     _write(rng, canvas, (int(w * 0.05), int(h * 0.16)), h * 0.11, int(w * 0.9), palette[0] * 0.2 + rng.choice([0, 200]))
-    return _grained(rng, canvas, 4)
+    return _grained(rng, canvas, 2)
 
 
 def glyphs(rng: np.random.Generator, size: Size) -> Bytes:
@@ -171,7 +173,7 @@ def glyphs(rng: np.random.Generator, size: Size) -> Bytes:
             tall = h * rng.uniform(0.03, 0.13)
         line += int(tall * 1.45)
         _write(rng, canvas, (int(w * 0.04), line), tall, int(w * 0.92), np.full(3, ink) + rng.normal(0, 15, 3))
-    return _grained(rng, canvas, 5)
+    return _grained(rng, canvas, 2)
 
 
 def _write(rng: np.random.Generator, canvas: Bytes, at: tuple[int, int], tall: float, wide: int, ink: Floats) -> None:
@@ -202,7 +204,7 @@ def blobs(rng: np.random.Generator, size: Size) -> Bytes:
                 cv2.fillPoly(canvas, [(at + r * np.stack([np.cos(turn), np.sin(turn)], 1)).astype(np.int32)], ink, cv2.LINE_AA)
             case _:
                 cv2.ellipse(canvas, at, (r, r // 3 + 1), rng.uniform(0, 180), 0, 360, ink, -1, cv2.LINE_AA)
-    return _grained(rng, canvas, 5)
+    return _grained(rng, canvas, 2)
 
 
 def street_map(rng: np.random.Generator, size: Size) -> Bytes:
@@ -220,7 +222,7 @@ def street_map(rng: np.random.Generator, size: Size) -> Bytes:
     canvas = np.ascontiguousarray(pixels(canvas))
     for x, y in seeds[:: max(1, len(seeds) // 18)]:
         _write(rng, canvas, (int(x), int(y)), max(7.0, size[0] * 0.022), int(size[1] * 0.14), np.full(3, 40.0))
-    return _grained(rng, canvas, 4)
+    return _grained(rng, canvas, 2)
 
 
 def julia(rng: np.random.Generator, size: Size) -> Bytes:
@@ -239,7 +241,7 @@ def julia(rng: np.random.Generator, size: Size) -> Bytes:
         z[magnitude >= 1e3] = 1e3
         smallest = np.minimum(smallest, magnitude)
         escaped += magnitude < 2
-    return _grained(rng, pixels(ramp((escaped / 28 + np.sqrt(smallest)) % 1.0, colours(rng, 7))), 5)
+    return _grained(rng, pixels(ramp((escaped / 28 + np.sqrt(smallest)) % 1.0, colours(rng, 7))), 2)
 
 
 def engraving(rng: np.random.Generator, size: Size) -> Bytes:
@@ -251,7 +253,7 @@ def engraving(rng: np.random.Generator, size: Size) -> Bytes:
         bend = 6 * fractal(rng, size, max(size) / 2, 3)
         waves = 0.5 + 0.5 * np.sin((x * np.cos(turn) + y * np.sin(turn) + bend) * rng.uniform(0.5, 0.9))
         canvas *= np.clip(0.5 + 4 * (waves - tone), 0, 1)
-    return _grained(rng, pixels(ramp(0.2 + 0.8 * canvas, colours(rng, 2, (0.05, 0.4)) * 0.3 + np.array([[15.0], [170.0]]))), 6)
+    return _grained(rng, pixels(ramp(0.2 + 0.8 * canvas, colours(rng, 2, (0.05, 0.4)) * 0.3 + np.array([[15.0], [170.0]]))), 3)
 
 
 def ornament(rng: np.random.Generator, size: Size) -> Bytes:
@@ -265,12 +267,13 @@ def ornament(rng: np.random.Generator, size: Size) -> Bytes:
     canvas = np.where(inside[..., None], ramp(0.5 + 0.3 * field, colours(rng, 6, (0.2, 0.9))), paper)
     edge = cv2.morphologyEx(inside.astype(np.uint8), cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)) > 0
     canvas[edge] = 30
-    return _grained(rng, pixels(canvas), 6)
+    return _grained(rng, pixels(canvas), 3)
 
 
 def _grained(rng: np.random.Generator, canvas: Bytes, strength: float) -> Bytes:
     """Canvas, paper or varnish: a fine grain, and a drift of tone."""
-    grain = fractal(rng, canvas.shape[:2], 6, 3, 0.8) * strength + fractal(rng, canvas.shape[:2], max(canvas.shape) / 2, 2) * strength
+    size = canvas.shape[0], canvas.shape[1]
+    grain = strength * fractal(rng, size, 6, 3, 0.8) + 2 * strength * fractal(rng, size, max(size) / 2, 2)
     return pixels(canvas + grain[..., None])
 
 

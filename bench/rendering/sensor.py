@@ -12,6 +12,7 @@ from bench.types import Bytes, Floats
 
 GREY = 0.16  # the linear value that exposure brings the image's geometric mean to
 HIGHEST_GAIN = 9.0  # of the automatic exposure: what is darker still stays dark
+MISTAKE = 0.2  # of the exposure, in stops
 SHOT, READ = 1.5e-4, 6e-4  # variance of a value of one, and deviation of darkness, at a gain of one
 SHOULDER = 0.35  # how soon the tone curve flattens
 
@@ -26,14 +27,19 @@ class Sensor:
     cast: float  # typical deviation of a colour's gain
 
 
-def expose(light: Floats, sensor: Sensor, rng: np.random.Generator) -> Bytes:
+def metered(light: Floats) -> float:
+    """The gain that an automatic exposure chooses for (H, W, 3) linear light."""
+    brightness = float(np.exp(np.log(light.mean(axis=2) + 1e-4).mean()))
+    return min(GREY / brightness, HIGHEST_GAIN)
+
+
+def expose(light: Floats, sensor: Sensor, gain: float, rng: np.random.Generator) -> Bytes:
     """(H, W, 3) linear light -> (H, W, 3) uint8"""
     blurred = _shaken(light, sensor.shake * abs(rng.normal()), rng.uniform(0, np.pi))
     focus = sensor.defocus * rng.uniform(0.5, 1.5)
     if focus > 0.1:
         blurred = cv2.GaussianBlur(blurred, (0, 0), focus)
-    brightness = float(np.exp(np.log(blurred.mean(axis=2) + 1e-4).mean()))
-    gain = min(GREY / brightness, HIGHEST_GAIN) * 2 ** rng.normal(0, 0.2)
+    gain *= 2 ** rng.normal(0, MISTAKE)
     values = blurred * _vignette(light.shape[:2])[..., None] * np.float32(gain) * rng.normal(1, sensor.cast, 3).astype(np.float32)
     deviation = np.sqrt(SHOT * gain * np.maximum(values, 0) + (READ * gain) ** 2) * np.float32(sensor.noise)
     values = np.maximum(values + deviation * rng.standard_normal(values.shape, dtype=np.float32), 0)

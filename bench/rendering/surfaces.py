@@ -18,9 +18,9 @@ from bench.types import Bytes, Floats
 def plaster(rng: np.random.Generator, size: Size, scale: float) -> Bytes:
     """A painted wall: roughness, stains, cracks here and there."""
     base = colours(rng, 1, (0.03, 0.3))[0] * 0.35 + 150
-    tone = 3.5 * fractal(rng, size, 0.03 * scale, 3, 0.8) + 7 * fractal(rng, size, 1.2 * scale, 5)
+    tone = 2.5 * fractal(rng, size, 0.03 * scale, 3, 0.8) + 7 * fractal(rng, size, 1.2 * scale, 5)
     canvas = np.ascontiguousarray(pixels(base + tone[..., None]))
-    for _ in range(int(rng.poisson(size[0] * size[1] / scale**2 / 3))):
+    for _ in range(int(rng.poisson(size[0] * size[1] / scale**2 / 6))):
         path = np.cumsum(rng.normal(0, 0.03 * scale, (24, 2)), axis=0) + rng.uniform(0, 1, 2) * size[::-1]
         cv2.polylines(canvas, [path.astype(np.int32)], False, colour(base * rng.uniform(0.6, 0.85)), 1, cv2.LINE_AA)
     return canvas
@@ -109,7 +109,11 @@ def wood(rng: np.random.Generator, size: Size, scale: float) -> Bytes:
     """Grain along the longer side."""
     base = np.array([132.0, 92.0, 58.0]) * rng.uniform(0.5, 1.25)
     h, w = size
-    stretched = fractal(rng, (h, max(1, w // 12)), 0.12 * scale, 5, 0.75) if w > h else fractal(rng, (max(1, h // 12), w), 0.12 * scale, 5, 0.75)
+    stretched = (
+        fractal(rng, (h, max(1, w // 12)), 0.12 * scale, 5, 0.75)
+        if w > h
+        else fractal(rng, (max(1, h // 12), w), 0.12 * scale, 5, 0.75)
+    )
     return pixels(base * (1 + 0.16 * cv2.resize(stretched, (w, h), interpolation=cv2.INTER_CUBIC))[..., None])
 
 
@@ -168,7 +172,13 @@ def ramp_sky(clouds: Floats) -> Floats:
 
 
 def _courses(
-    rng: np.random.Generator, size: Size, scale: float, piece: tuple[float, float], base: Floats, spread: float, grain: float = 1.0
+    rng: np.random.Generator,
+    size: Size,
+    scale: float,
+    piece: tuple[float, float],
+    base: Floats,
+    spread: float,
+    grain: float = 1.0,
 ) -> Bytes:
     """Rows of pieces, `piece` = (length, height) in metres, each row shifted; every piece has its own tone and its own grain."""
     h, w = size
@@ -180,7 +190,7 @@ def _courses(
     tones = rng.normal(0, spread, (int(row.max()) + 1, int(column.max()) + 1))[row, column]
     fine = fractal(rng, (h, max(8, int(w / grain))), 0.06 * scale, 4, 0.8)
     rough = cv2.resize(fine, (w, h), interpolation=cv2.INTER_CUBIC) + 0.7 * fractal(rng, size, scale, 4)
-    canvas = base + (tones + 9 * rough)[..., None] * np.array([1.0, 0.85, 0.75])
+    canvas = base + (tones + 5 * rough)[..., None] * np.array([1.0, 0.85, 0.75])
     joint = max(1, int(0.012 * scale))
     gap = (y % tall < joint) | ((x + shift) % long < joint)
     canvas[gap] = canvas[gap] * 0.55 + (25 if grain > 1 else 70)

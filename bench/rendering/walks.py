@@ -72,7 +72,9 @@ def references(rooms: tuple[Room, ...], count: int, building: Building, seed: in
             yield room, lap, _beside(rng, planned, building, spread=0.15)
 
 
-def queries(rooms: tuple[Room, ...], count: int, building: Building, seed: int, viewpoint: float) -> Iterator[tuple[Room, Station]]:
+def queries(
+    rooms: tuple[Room, ...], count: int, building: Building, seed: int, viewpoint: float
+) -> Iterator[tuple[Room, Station]]:
     """`count` stations anywhere beside the walks; `viewpoint` scales how far."""
     weights = np.array([room.perimeter for room in rooms])
     for number in range(count):

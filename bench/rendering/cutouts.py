@@ -132,7 +132,15 @@ def _torso(rng: np.random.Generator, canvas: Bytes, opacity: Bytes, skin: Ink) -
         hand = at(side * (72 + swing), 262)
         cv2.circle(canvas, (int(hand[0]), int(hand[1])), 10, skin, -1, cv2.LINE_AA)
         cv2.circle(opacity, (int(hand[0]), int(hand[1])), 10, 255, -1, cv2.LINE_AA)
-        sleeve = [(40, 84), (62, 96), (78 + swing * 0.6, 180), (84 + swing, 256), (64 + swing, 258), (56 + swing * 0.4, 190), (40, 130)]
+        sleeve = [
+            (40, 84),
+            (62, 96),
+            (78 + swing * 0.6, 180),
+            (84 + swing, 256),
+            (64 + swing, 258),
+            (56 + swing * 0.4, 190),
+            (40, 130),
+        ]
         _paint(canvas, opacity, [at(side * x, y) for x, y in sleeve], cloth)
     trunk = [(-18, 74), (18, 74), (52, 86), (58, 120), (48, 190), (52, 268), (-52, 268), (-48, 190), (-58, 120), (-52, 86)]
     _paint(canvas, opacity, [at(x, y) for x, y in trunk], cloth)
