@@ -280,9 +280,7 @@ def _dataset(args: argparse.Namespace) -> int:
             given |= spec.parse(f"{plugin.name()}:{name}={value}", registry.DATASET)[1]
     scene = spec.build(plugin, given).scene()
     export.write(scene, args.layout, args.out)
-    print(
-        f"{args.out}: {len(scene.references)} references and {len(scene.queries)} queries of {scene.name}, laid out as {args.layout}"
-    )
+    print(f"{args.out}: {len(scene.references)} references and {len(scene.queries)} queries of {scene.name}, as {args.layout}")
     return DONE
 
 

@@ -1,8 +1,8 @@
-"""Aachen Day-Night, versions 1 and 1.1, as downloaded (Sattler et al., CVPR 2018; Zhang et al., IJCV 2020), and what its server takes.
+"""Aachen Day-Night, versions 1 and 1.1, as downloaded (Sattler et al., CVPR 2018; Zhang et al., IJCV 2020), and for its server.
 
-    images/images_upright/ or images_upright/      references and queries
-    3D-models/                                     v1: aachen_cvpr2018_db.nvm, here or in aachen_v_1/, with database_intrinsics.txt
-                                                   v1.1: aachen_v_1_1/, a COLMAP model, or an NVM with database_intrinsics_v1_1.txt
+    images/images_upright/ or images_upright/   references and queries
+    3D-models/                                  v1: aachen_cvpr2018_db.nvm, here or in aachen_v_1/, with database_intrinsics.txt;
+                                                v1.1: aachen_v_1_1/, a COLMAP model, or an NVM with database_intrinsics_v1_1.txt
     queries/{day,night}_time_queries_with_intrinsics*.txt
 
 The poses of its queries are withheld. A file ground_truth.txt, which the download does not have, is read where it is: the gallery
@@ -20,7 +20,7 @@ from typing import Literal, get_args
 import pycolmap
 
 from bench.datasets import colmap, lists, nvm
-from bench.datasets.colmap import Reference
+from bench.datasets.colmap import Placed
 from bench.datasets.scene import Condition, Scene
 from bench.errors import UserError
 from bench.plugin import Dataset
@@ -102,7 +102,7 @@ def write_evaluation(folder: Path, method: str, poses: Mapping[str, pycolmap.Rig
     return path, len(poses) - len(found)
 
 
-def _references(root: Path, version: Version | None) -> dict[str, Reference]:
+def _references(root: Path, version: Version | None) -> dict[str, Placed]:
     folder = root / "3D-models"
     there = [
         (number, path)
@@ -123,7 +123,7 @@ def _is_model(path: Path) -> bool:
     return path.is_file() if path.suffix == ".nvm" else colmap.is_model(path)
 
 
-def _from_nvm(path: Path) -> dict[str, Reference]:
+def _from_nvm(path: Path) -> dict[str, Placed]:
     """The NVM's poses with the intrinsics beside it."""
     beside = sorted(path.parent.glob(INTRINSICS))
     if len(beside) != 1:

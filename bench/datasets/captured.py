@@ -1,9 +1,9 @@
 """A folder of photographs of one place by one camera, as a scene: structure from motion gives the poses.
 
-The poses, of all photographs with raw descriptors, are the ground truth, as they were for Aachen. Every fifth photograph is a query;
-it has no part in the map or the dictionary, which are made from references alone. Structure from motion leaves the unit of length
-open; here it is fixed by the distance of two cameras: unless two are named, the first photograph by name and the one halfway down
-the list.
+The poses, of all photographs with raw descriptors, are the ground truth, as they were for Aachen. Every fifth photograph is a
+query; it has no part in the map or the dictionary, which are made from references alone. Structure from motion leaves the unit
+of length open; here it is fixed by the distance of two cameras: unless two are named, those of the first photograph by name and of
+the one halfway down the list.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ import numpy as np
 import pycolmap
 
 from bench.datasets import colmap
-from bench.datasets.colmap import Reference
+from bench.datasets.colmap import Placed
 from bench.datasets.photographs import Source, folder
-from bench.datasets.scene import File, Scene, SceneImage
+from bench.datasets.scene import File, Reference, Scene
 from bench.errors import UserError
 from bench.plugin import Dataset
 
@@ -52,7 +52,8 @@ class Captured(Dataset):
         scale = self.length / _distance(found, first, second)
         held_out = {source.name for source in sources[:: self.held_out]}
         images = {
-            name: _image(self.path, name, camera, _scaled(pose, scale)) for name, (_, camera, pose) in sorted(found.items())
+            name: _image(self.path / name, camera, pycolmap.Rigid3d(pose.rotation, pose.translation * scale), name)
+            for name, (_, camera, pose) in sorted(found.items())
         }
         return Scene(
             name=self.path.name,
@@ -103,7 +104,7 @@ def _quietly() -> Iterator[None]:
         pycolmap.logging.minloglevel = before
 
 
-def _distance(found: dict[str, Reference], first: str, second: str) -> float:
+def _distance(found: dict[str, Placed], first: str, second: str) -> float:
     for name in (first, second):
         if name not in found:
             raise UserError(
@@ -116,18 +117,9 @@ def _distance(found: dict[str, Reference], first: str, second: str) -> float:
     return distance
 
 
-def _scaled(pose: pycolmap.Rigid3d, scale: float) -> pycolmap.Rigid3d:
-    return pycolmap.Rigid3d(pose.rotation, pose.translation * scale)
-
-
-def _image(directory: Path, name: str, camera: pycolmap.Camera, pose: pycolmap.Rigid3d) -> SceneImage:
-    return SceneImage(
-        name=name,
-        camera=camera,
-        cam_from_world=pose,
-        condition="day",
-        pixels=File(path=directory / name, size=(camera.width, camera.height)),
-    )
+def _image(path: Path, camera: pycolmap.Camera, pose: pycolmap.Rigid3d, name: str) -> Reference:
+    pixels = File(path=path, size=(camera.width, camera.height))
+    return Reference(name=name, camera=camera, cam_from_world=pose, condition="day", pixels=pixels)
 
 
 PLUGIN = Captured

@@ -20,7 +20,7 @@ from typing import get_args
 import pycolmap
 
 from bench.datasets import lists
-from bench.datasets.scene import Condition, File, Scene, SceneImage
+from bench.datasets.scene import Condition, File, Reference, Scene, SceneImage
 from bench.errors import UserError
 from bench.plugin import Dataset
 
@@ -73,13 +73,13 @@ def ground_truth(root: Path) -> Path | None:
     return next((path for path in (root / "ground_truth.txt", root / "ground_truth") if path.exists()), None)
 
 
-Reference = tuple[str, pycolmap.Camera, pycolmap.Rigid3d]  # where it stands, for messages; intrinsics; camera from world
+Placed = tuple[str, pycolmap.Camera, pycolmap.Rigid3d]  # where it stands, for messages; intrinsics; camera from world
 
 
 def assemble(
     name: str,
     *,
-    references: Mapping[str, Reference],
+    references: Mapping[str, Placed],
     queries: Mapping[Condition, Path],
     images: Path,
     ground_truth: Path | None = None,
@@ -94,7 +94,10 @@ def assemble(
     """
     poses = {} if ground_truth is None else _poses(ground_truth)
     shown = [
-        _image(name, where, camera, pose, "day", images, masks) for name, (where, camera, pose) in sorted(references.items())
+        Reference(
+            name=name, camera=camera, cam_from_world=pose, condition="day", pixels=_file(name, where, camera, images, masks)
+        )
+        for name, (where, camera, pose) in sorted(references.items())
     ]
     asked: dict[str, SceneImage] = {}
     for condition, path in queries.items():
@@ -102,14 +105,15 @@ def assemble(
             where = f"{path}:{line}"
             if query in references or query in asked:
                 raise UserError(f"{where}: {query} is {'a reference' if query in references else 'in another list'} as well")
-            asked[query] = _image(query, where, camera, poses.pop(query, (where, None))[1], condition, images, masks)
+            pixels, pose = _file(query, where, camera, images, masks), poses.pop(query, (where, None))[1]
+            asked[query] = SceneImage(name=query, camera=camera, cam_from_world=pose, condition=condition, pixels=pixels)
     if poses:
         stray, (where, _) = next(iter(poses.items()))
         raise UserError(f"{where}: a pose of {stray}, which is no query")
     return Scene(name=name, references=tuple(shown), queries=tuple(asked.values()))
 
 
-def read_model(folder: Path) -> dict[str, Reference]:
+def read_model(folder: Path) -> dict[str, Placed]:
     """The images of a COLMAP model that have a pose.
 
     Raises
@@ -166,26 +170,12 @@ def _poses(path: Path) -> dict[str, tuple[str, pycolmap.Rigid3d]]:
     return {name: (f"{path}:{line}", pose) for name, (line, pose) in lists.read_poses(path).items()}
 
 
-def _image(
-    name: str,
-    where: str,
-    camera: pycolmap.Camera,
-    pose: pycolmap.Rigid3d | None,
-    condition: Condition,
-    images: Path,
-    masks: Path | None,
-) -> SceneImage:
+def _file(name: str, where: str, camera: pycolmap.Camera, images: Path, masks: Path | None) -> File:
     path = images / name
     if not path.is_file():
         raise UserError(f"{where}: there is no image {path}")
     mask = None if masks is None else (masks / name).with_suffix(".png")
-    return SceneImage(
-        name=name,
-        camera=camera,
-        cam_from_world=pose,
-        condition=condition,
-        pixels=File(path=path, size=(camera.width, camera.height), mask=mask if mask is not None and mask.is_file() else None),
-    )
+    return File(path=path, size=(camera.width, camera.height), mask=mask if mask is not None and mask.is_file() else None)
 
 
 PLUGIN = Colmap

@@ -1,6 +1,6 @@
 """Writes a scene to disk in the layouts that `bench.datasets.aachen` and `bench.datasets.colmap` read.
 
-Images are PNG, so what is read back is what was rendered. Masks of what moves and the ground truth are written beside, where known.
+Images are PNG, so what is read back is what was rendered. Masks of what moves and the ground truth stand beside, where known.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import pycolmap
 from PIL import Image
 
 from bench.datasets import colmap, lists, nvm
-from bench.datasets.scene import Condition, Scene, SceneImage
+from bench.datasets.scene import Condition, Reference, Scene
 from bench.errors import UserError
 from bench.progress import Progress
 
@@ -49,9 +49,7 @@ def _as_aachen(scene: Scene, out: Path) -> Path:
     """Version 1: an NVM model with intrinsics beside it. -> the folder for images"""
     queries = _by_condition(scene)
     if len(queries) != len(get_args(Condition)):
-        raise UserError(
-            f"--layout aachen: needs queries by day and by night; there are some {' and '.join(queries) or 'at no time'}"
-        )
+        raise UserError(f"--layout aachen: needs queries by day and by night; these are by {' and '.join(queries) or 'neither'}")
     models = out / "3D-models"
     nvm.write(models / "aachen_cvpr2018_db.nvm", {image.name: (image.camera, image.cam_from_world) for image in scene.references})
     lists.write_intrinsics(models / "database_intrinsics.txt", {image.name: image.camera for image in scene.references})
@@ -70,7 +68,7 @@ def _as_colmap(scene: Scene, out: Path) -> Path:
     return out / "images"
 
 
-def model(images: tuple[SceneImage, ...]) -> pycolmap.Reconstruction:
+def model(images: tuple[Reference, ...]) -> pycolmap.Reconstruction:
     """A reconstruction of the images' cameras and poses, without points; images with equal intrinsics share a camera.
 
     Images are numbered from 1 in the order given.
@@ -79,11 +77,11 @@ def model(images: tuple[SceneImage, ...]) -> pycolmap.Reconstruction:
     numbers: dict[tuple[object, ...], int] = {}
     for number, image in enumerate(images, 1):
         camera = image.camera
-        key = (camera.model, camera.width, camera.height, *camera.params)
+        key = (camera.model, camera.width, camera.height, *camera.params.tolist())
         if key not in numbers:
             numbers[key] = len(numbers) + 1
             shared = pycolmap.Camera.create_from_model_name(numbers[key], camera.model.name, 1.0, camera.width, camera.height)
-            shared.params = camera.params
+            shared.params = camera.params.tolist()
             built.add_camera_with_trivial_rig(shared)
         added = pycolmap.Image(name=image.name, camera_id=numbers[key], image_id=number)
         built.add_image_with_trivial_frame(added, image.cam_from_world)

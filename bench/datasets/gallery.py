@@ -18,7 +18,7 @@ import numpy as np
 import pycolmap
 
 import bench.rendering
-from bench.datasets.scene import Condition, Mask, Pixels, Scene, SceneImage
+from bench.datasets.scene import Condition, Mask, Pixels, Reference, Scene, SceneImage
 from bench.errors import UserError
 from bench.plugin import Dataset
 from bench.rendering import crowd, cutouts, walks
@@ -70,8 +70,8 @@ class Gallery(Dataset):
         model = _model(self)
         return Scene(
             name="gallery",
-            references=tuple(_image(model, "reference", index) for index in range(self.views)),
-            queries=tuple(_image(model, "query", index) for index in range(self.queries)),
+            references=tuple(_reference(model, index) for index in range(self.views)),
+            queries=tuple(_query(model, index) for index in range(self.queries)),
         )
 
 
@@ -180,16 +180,31 @@ def _camera(gallery: Gallery, zoom: float) -> pycolmap.Camera:
     return pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", round(float(focal), 3), gallery.width, gallery.height)
 
 
-def _image(model: _Model, kind: Kind, index: int) -> SceneImage:
-    taken = model.taken[kind][index]
-    rotation, centre = taken.station.rotation, taken.station.centre
+def _reference(model: _Model, index: int) -> Reference:
+    taken = model.taken["reference"][index]
+    return Reference(
+        name=taken.name,
+        camera=taken.camera,
+        cam_from_world=_pose(taken),
+        condition=taken.condition,
+        pixels=Rendered(gallery=model.gallery, kind="reference", index=index),
+    )
+
+
+def _query(model: _Model, index: int) -> SceneImage:
+    taken = model.taken["query"][index]
     return SceneImage(
         name=taken.name,
         camera=taken.camera,
-        cam_from_world=pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ centre),
+        cam_from_world=_pose(taken),
         condition=taken.condition,
-        pixels=Rendered(gallery=model.gallery, kind=kind, index=index),
+        pixels=Rendered(gallery=model.gallery, kind="query", index=index),
     )
+
+
+def _pose(taken: _Taken) -> pycolmap.Rigid3d:
+    rotation = taken.station.rotation
+    return pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ taken.station.centre)
 
 
 def _eye(taken: _Taken) -> Eye:

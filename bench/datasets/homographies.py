@@ -19,7 +19,7 @@ from bench.datasets import lists
 from bench.datasets.photographs import Source, builtin, decode, square
 from bench.datasets.scene import File, Pixels
 from bench.errors import UserError
-from bench.rendering.mipmap import GAMMA
+from bench.rendering.mipmap import decoded
 from bench.rendering.raster import Doubles
 from bench.rendering.sensor import Sensor, expose
 from bench.types import Bytes
@@ -57,13 +57,13 @@ class Warped(Pixels):
 
     def read(self) -> Bytes:
         image = square(decode(self.source.path)[0], SIDE)
-        linear = ((image / 255.0) ** GAMMA).astype(np.float32)
+        linear = decoded(image)
         # Twice as large first, so that what shrinks is averaged.
         larger = np.diag([2.0, 2.0, 1.0]) @ np.array(self.homography).reshape(3, 3)
         to_opencv = np.linalg.inv(HALF_PIXEL) @ larger @ HALF_PIXEL
         seen = cv2.warpPerspective(linear, to_opencv, (2 * SIDE, 2 * SIDE), borderValue=GREY)
         seen = cv2.resize(seen, (SIDE, SIDE), interpolation=cv2.INTER_AREA)
-        return expose(seen, SENSOR, GAIN, np.random.default_rng([self.seed, 1]))
+        return expose(np.asarray(seen, np.float32), SENSOR, GAIN, np.random.default_rng([self.seed, 1]))
 
 
 def made(seed: int, each: int) -> list[Pair]:
@@ -91,7 +91,7 @@ def _random(rng: np.random.Generator) -> Doubles:
     c, s = np.cos(turn), np.sin(turn)
     moved = (corners - SIDE / 2) @ (zoom * np.array([[c, s], [-s, c]])) + SIDE / 2 + rng.normal(0, 0.04, 2) * SIDE
     moved += rng.uniform(-0.125, 0.125, (4, 2)) * SIDE
-    return cv2.getPerspectiveTransform(corners.astype(np.float32), moved.astype(np.float32))
+    return np.asarray(cv2.getPerspectiveTransform(corners.astype(np.float32), moved.astype(np.float32)), np.float64)
 
 
 def hpatches(root: Path) -> list[Pair]:
@@ -133,7 +133,7 @@ def _stored(path: Path) -> File:
 
 def _read(path: Path) -> Doubles:
     """(3, 3), with a last element of one"""
-    rows = []
+    rows: list[np.ndarray] = []
     for line, fields in lists.lines(path):
         where = f"{path}:{line}"
         if len(fields) != 3 or len(rows) == 3:

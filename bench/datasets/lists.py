@@ -94,7 +94,7 @@ def camera(fields: Sequence[str], where: str) -> pycolmap.Camera:
     params = numbers(fields[3:], where)
     if len(params) != len(found.params):
         raise UserError(f"{where}: {model} has {len(found.params)} parameters ({found.params_info}), but {len(params)} are given")
-    found.params = params
+    found.params = params.tolist()
     if not all(params[index] > 0 for index in found.focal_length_idxs()):
         raise UserError(f"{where}: the focal length must be above zero, not {' '.join(fields[3:])}")
     return found

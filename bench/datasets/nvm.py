@@ -1,7 +1,7 @@
 """VisualSFM's models (NVM_V3): the names and poses of the cameras. Points are not read: they are triangulated anew.
 
-After the header and the number of cameras, each camera is a line `name focal qw qx qy qz cx cy cz distortion 0`: the rotation from
-world to camera, and the camera's centre in the world. The focal length and distortion are not used: Aachen's notes say that
+After the header and the number of cameras, each camera is a line `name focal qw qx qy qz cx cy cz distortion 0`: the rotation
+from world to camera, and the camera's centre in the world. The focal length and distortion are not used: Aachen's notes say that
 the intrinsics beside the model are the right ones.
 """
 
@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-import numpy as np
 import pycolmap
 
 from bench.datasets import lists

@@ -89,9 +89,9 @@ def builtin() -> list[Source]:
 
 def of_things() -> list[Source]:
     """Pictures that the libraries' wheels carry and that show nobody."""
-    names = ("chelsea.png", "coffee.png", "rocket.jpg", "motorcycle_left.png", "coins.png", "hubble_deep_field.jpg")
-    names += ("ihc.png", "moon.png", "page.png", "retina.jpg", "text.png", "logo.png")
-    return [*_of_scikit_image(*names), *_of_scikit_learn("china.jpg", "flower.jpg")]
+    first = ("chelsea.png", "coffee.png", "rocket.jpg", "motorcycle_left.png", "coins.png", "hubble_deep_field.jpg")
+    others = ("ihc.png", "moon.png", "page.png", "retina.jpg", "text.png", "logo.png")
+    return [*_of_scikit_image(*first, *others), *_of_scikit_learn("china.jpg", "flower.jpg")]
 
 
 def of_grounds() -> list[Source]:
@@ -136,7 +136,7 @@ def read(path: Path) -> Photograph:
 
 
 def decode(path: Path, upright: bool = True) -> tuple[Image.Image, tuple[str, ...]]:
-    """Return an 8-bit RGB image of the file's own size, and notes on what was converted; EXIF rotation is applied if `upright`."""
+    """Return an 8-bit RGB image of the file's own size, and notes on what was converted. `upright` applies EXIF rotation."""
     try:
         with Image.open(path) as opened:
             opened.load()

@@ -1,8 +1,8 @@
 """A place that was photographed: reference images whose poses are known, and queries to be localized or reconstructed.
 
 One convention everywhere, COLMAP's. A pose is `cam_from_world`: x_camera = R x_world + t; the camera's x goes right, its y down,
-its z forward, and its centre is -Rᵀt. In an image the centre of the top-left pixel is (0.5, 0.5). Quaternions in files are written
-w x y z (pycolmap's own arrays are x y z w).
+its z forward, and its centre is -Rᵀt. In an image the centre of the top-left pixel is (0.5, 0.5). Quaternions in files are
+written w x y z (pycolmap's own arrays are x y z w).
 """
 
 from __future__ import annotations
@@ -80,11 +80,18 @@ class SceneImage:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Reference(SceneImage):
+    """An image of the map: its pose is known."""
+
+    cam_from_world: pycolmap.Rigid3d
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Scene:
     """Reference images, each with its pose, and queries."""
 
     name: str
-    references: tuple[SceneImage, ...]
+    references: tuple[Reference, ...]
     queries: tuple[SceneImage, ...]
     unit: str = "metre"  # of length, in words
     left_out: tuple[str, ...] = ()  # photographs that have no pose, so that nothing could be measured with them

@@ -5,16 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 from typing import TypeVar
 
 import numpy as np
 
 from bench.rendering import paintings, surfaces
 from bench.rendering.light import Lamp, Lighting, Occluders, fall
-from bench.rendering.mipmap import GAMMA, Texture, sample
+from bench.rendering.mipmap import Texture, sample
 from bench.rendering.noise import Size, fractal, pixels
 from bench.rendering.raster import Doubles, Quad
-from bench.rendering.rooms import COURTYARD, DOORS, ROOMS, UP, Room, Wall, walls
+from bench.rendering.rooms import DOORS, ROOMS, UP, Room, Wall, walls
 from bench.types import Bytes, Floats
 
 WALL, FLOOR, PICTURE = 180.0, 160.0, 400.0  # texels a metre
@@ -79,7 +80,7 @@ class Building:
         below = 1 + np.maximum(directions[:, 2], -0.5)
         u, v = (0.5 + 0.25 * directions[:, axis] / below for axis in (0, 1))
         light = sample(self.sky.levels[0], u, v)
-        return light * np.float32(self.lightings[night].sky)
+        return light * np.array(self.lightings[night].sky, np.float32)
 
 
 def build(seed: int, *, repeats: float, bare: float, detail: float) -> Building:
@@ -285,10 +286,8 @@ class _Furnisher:
         for item in _choose(rng, (INDOORS, INDOORS[::-1])) if room.roofed else OUTDOORS:
             for _ in range(40):
                 x, y = rng.uniform(room.west, room.east), rng.uniform(room.south, room.north)
-                near = [
-                    door for door in DOORS if np.hypot((door.west + door.east) / 2 - x, (door.south + door.north) / 2 - y) < 2.2
-                ]
-                if room.holds(x, y, 1.6) and not near and all(other.distance(x, y) > 2 * CLEAR for other in self.standing):
+                clear = all(np.hypot(*(door.centre - (x, y))) > 2.2 for door in DOORS)
+                if room.holds(x, y, 1.6) and clear and all(other.distance(x, y) > 2 * CLEAR for other in self.standing):
                     getattr(self, item)(np.array([x, y, 0.0]), rng.uniform(0, np.pi))
                     break
 
@@ -317,7 +316,7 @@ class _Furnisher:
         radius, tall = 0.75, 2.6
         edges = turn + np.arange(9) * np.pi / 4
         rim = at + radius * np.stack([np.cos(edges), np.sin(edges), 0 * edges], axis=1) + tall * UP  # (9, 3)
-        for left, right in zip(rim, rim[1:], strict=False):
+        for left, right in pairwise(rim):
             self._add(left, right - left, -UP * tall, self._sheet(float(np.linalg.norm(right - left)), tall))
         self.standing.append(Footprint(at[0], at[1], (radius * 0.8, radius * 0.8), turn))
 

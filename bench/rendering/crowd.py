@@ -25,7 +25,7 @@ def gather(
     half = np.arctan(eye.size[0] / 2 / eye.calibration[0, 0])
     present = []
     for _ in range(rng.poisson(mean)):
-        person = cast[rng.integers(len(cast))]
+        person = cast[int(rng.integers(len(cast)))]
         bearing = np.arctan2(forward[1], forward[0]) + rng.uniform(-0.9, 0.9) * half
         feet = feet_of_camera + rng.uniform(NEAR, FAR) * np.array([np.cos(bearing), np.sin(bearing), 0.0])
         if building.free(feet[0], feet[1], ROOM):

@@ -34,8 +34,8 @@ CAMERAMAN = (
 )  # fmt: skip
 ADMIRAL = (
     (256, 20), (230, 27), (205, 40), (180, 62), (172, 88), (155, 104), (148, 126), (150, 165), (158, 195), (160, 260), (172, 290),
-    (196, 305), (201, 322), (147, 350), (100, 362), (62, 376), (44, 405), (40, 450), (40, 599), (504, 599), (502, 450), (498, 408),
-    (480, 386), (422, 362), (345, 322), (340, 300), (352, 285), (362, 262), (366, 225), (374, 205), (374, 160), (371, 100),
+    (196, 305), (201, 322), (147, 350), (100, 362), (62, 376), (44, 405), (40, 450), (40, 599), (504, 599), (502, 450),
+    (498, 408), (480, 386), (422, 362), (345, 322), (340, 300), (352, 285), (362, 262), (366, 225), (374, 205), (374, 160), (371, 100),
     (352, 84), (335, 52), (300, 30),
 )  # fmt: skip
 
@@ -81,7 +81,12 @@ def drawn(rng: np.random.Generator) -> Person:
 
 def _person(rng: np.random.Generator, canvas: Bytes, opacity: Bytes, tall: float) -> Person:
     folds = 1 + 0.1 * fractal(rng, canvas.shape[:2], 60, 5, 0.7)
-    return Person(pixels(canvas * folds[..., None]), opacity.astype(np.float32) / 255, tall)
+    return Person(pixels(canvas * folds[..., None]), _share(opacity), tall)
+
+
+def _share(opacity: Bytes) -> Floats:
+    """0 to 255 -> 0 to 1"""
+    return (opacity / 255).astype(np.float32)
 
 
 def _paint(canvas: Bytes, opacity: Bytes, outline: list[tuple[float, float]], cloth: Bytes | Ink) -> None:
@@ -183,7 +188,7 @@ def _cut(photograph: Bytes, outline: tuple[tuple[int, int], ...], tall: float) -
     cv2.fillPoly(opacity, [points], 255, cv2.LINE_AA)
     (left, top), (right, bottom) = points.min(axis=0), points.max(axis=0) + 1
     area = slice(top, bottom), slice(left, right)
-    return Person(np.ascontiguousarray(photograph[area]), opacity[area].astype(np.float32) / 255, tall)
+    return Person(np.ascontiguousarray(photograph[area]), _share(opacity[area]), tall)
 
 
 def _standing(rng: np.random.Generator, photograph: Bytes, outline: tuple[tuple[int, int], ...], wide: int) -> Person:
@@ -199,4 +204,4 @@ def _standing(rng: np.random.Generator, photograph: Bytes, outline: tuple[tuple[
     solid = shown > 0.5
     canvas[area][solid] = cv2.resize(bust.pixels, (wide, tall), interpolation=cv2.INTER_AREA)[solid]
     opacity[area][solid] = 255
-    return Person(canvas, opacity.astype(np.float32) / 255, tall=1.78)
+    return Person(canvas, _share(opacity), tall=1.78)

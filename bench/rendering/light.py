@@ -1,6 +1,6 @@
-"""How bright each place of a scene is: lamps and the sun with shadows, and the light that comes from all around, gathered by rays.
+"""How bright each place of a scene is: lamps and the sun with shadows, and the light from all around, gathered by rays.
 
-One bounce is assumed to be the same everywhere in a room; corners and what stands close to something are darker, as they should be.
+The light that walls return is taken to be the same everywhere in a room; corners, and what stands close to something, are darker.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Occluders:
         return cls(*rows)
 
     def distance(self, origins: Floats, directions: Floats) -> Floats:
-        """How far each ray goes before it meets something, in units of its direction; infinite if it meets nothing. (n, 3) -> (n,)"""
+        """How far each ray goes before it meets something, in units of its direction, or infinity. (n, 3), (n, 3) -> (n,)"""
         step = max(1, BLOCK // len(self.corner))
         parts = [self._distance(origins[i : i + step], directions[i : i + step]) for i in range(0, max(1, len(origins)), step)]
         return np.concatenate(parts)
@@ -80,13 +80,12 @@ def fall(points: Floats, normals: Floats, occluders: Occluders, lightings: tuple
     seen = _gather(starts, normals, occluders)
     found = []
     for lighting in lightings:
-        total = seen @ np.array([lighting.sky, lighting.bounce], np.float32)
-        sun = np.array(lighting.towards_sun, np.float32)
-        total += _from(starts, normals, occluders, np.broadcast_to(sun * 100, points.shape), far=True) * np.float32(lighting.sun)
+        total = seen @ np.array([lighting.sky, lighting.bounce])
+        sun = np.broadcast_to(100 * np.array(lighting.towards_sun, np.float32), points.shape)
+        total += _from(starts, normals, occluders, sun, far=True).astype(np.float64) * np.array(lighting.sun)
         for lamp in lighting.lamps:
-            total += _from(starts, normals, occluders, np.array(lamp.at, np.float32) - starts, far=False) * np.float32(
-                lamp.colour
-            )
+            towards = np.array(lamp.at, np.float32) - starts
+            total += _from(starts, normals, occluders, towards, far=False).astype(np.float64) * np.array(lamp.colour)
         found.append(total.astype(np.float32))
     return found
 
@@ -107,7 +106,7 @@ def _gather(starts: Floats, normals: Floats, occluders: Occluders) -> Floats:
         outside = np.isinf(away)
         shares[:, 0] += outside & (direction[:, 2] > 0)
         shares[:, 1] += np.where(outside, 0.4, np.minimum(away, REACH) / REACH)
-    return shares / RAYS
+    return (shares / RAYS).astype(np.float32)
 
 
 def _from(starts: Floats, normals: Floats, occluders: Occluders, towards: Floats, far: bool) -> Floats:

@@ -26,7 +26,7 @@ class Texture:
         levels = [pixels]
         while min(levels[-1].shape[:2]) >= 2 * SMALLEST:
             h, w = levels[-1].shape[:2]
-            levels.append(cv2.resize(levels[-1], (w // 2, h // 2), interpolation=cv2.INTER_AREA))
+            levels.append(np.asarray(cv2.resize(levels[-1], (w // 2, h // 2), interpolation=cv2.INTER_AREA), np.uint8))
         return cls(tuple(levels))
 
     @property
@@ -51,6 +51,11 @@ class Texture:
         return values
 
 
+def decoded(pixels: Bytes) -> Floats:
+    """Display-encoded values as linear light, 0 to 1."""
+    return _LINEAR[pixels]
+
+
 _LINEAR = ((np.arange(256) / 255.0) ** GAMMA).astype(np.float32)
 
 
@@ -69,5 +74,5 @@ def sample(image: np.ndarray, u: Floats, v: Floats) -> Floats:
     y -= 0.5
     maps = x.reshape(rows, ROW), y.reshape(rows, ROW)
     found = cv2.remap(image, *maps, interpolation=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    values = found.reshape(rows * ROW, -1)[:count]
-    return _LINEAR[values] if image.dtype == np.uint8 else values
+    values: np.ndarray = found.reshape(rows * ROW, -1)[:count]
+    return decoded(values) if image.dtype == np.uint8 else values

@@ -38,7 +38,7 @@ def cells(rng: np.random.Generator, size: Size, count: int) -> tuple[np.ndarray,
     distance, labels = cv2.distanceTransformWithLabels(marked, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
     renamed = np.zeros(labels.max() + 1, np.int32)
     renamed[labels[seeds[:, 1], seeds[:, 0]]] = np.arange(len(seeds))
-    return renamed[labels], distance, seeds
+    return renamed[labels], np.asarray(distance, np.float32), seeds
 
 
 def colours(rng: np.random.Generator, count: int, saturation: tuple[float, float] = (0.1, 0.75)) -> Floats:
@@ -48,7 +48,7 @@ def colours(rng: np.random.Generator, count: int, saturation: tuple[float, float
     return cv2.cvtColor(hsv.astype(np.uint8)[None], cv2.COLOR_HSV2RGB)[0].astype(np.float32)
 
 
-def ramp(values: Floats, palette: Floats) -> Floats:
+def ramp(values: np.ndarray, palette: np.ndarray) -> np.ndarray:
     """Colours along a palette. values (h, w), 0 to 1; palette (n, 3) -> (h, w, 3)"""
     position = np.clip(values, 0, 1) * (len(palette) - 1)
     low = np.minimum(position.astype(np.int32), len(palette) - 2)
@@ -61,7 +61,7 @@ def pixels(values: np.ndarray) -> Bytes:
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)
 
 
-def colour(row: Floats) -> tuple[int, int, int]:
+def colour(row: np.ndarray) -> tuple[int, int, int]:
     """One colour as OpenCV's drawing wants it."""
     red, green, blue = (int(value) for value in row)
     return red, green, blue

@@ -11,7 +11,7 @@ import numpy as np
 
 from bench.datasets.photographs import decode, of_things
 from bench.rendering.noise import Size, cells, colour, colours, fractal, pixels, ramp
-from bench.types import Bytes, Floats
+from bench.types import Bytes
 
 FONTS = (
     cv2.FONT_HERSHEY_SIMPLEX,
@@ -176,10 +176,10 @@ def glyphs(rng: np.random.Generator, size: Size) -> Bytes:
     return _grained(rng, canvas, 2)
 
 
-def _write(rng: np.random.Generator, canvas: Bytes, at: tuple[int, int], tall: float, wide: int, ink: Floats) -> None:
+def _write(rng: np.random.Generator, canvas: Bytes, at: tuple[int, int], tall: float, wide: int, ink: np.ndarray) -> None:
     font = FONTS[rng.integers(len(FONTS))]
     scale = tall / cv2.getTextSize("Hg", font, 1.0, 1)[0][1]
-    words = []
+    words: list[str] = []
     while cv2.getTextSize(" ".join(words), font, scale, 1)[0][0] < wide * rng.uniform(0.7, 1.1) and len(words) < 40:
         words.append("".join(rng.choice(LETTERS, rng.integers(2, 9))))
     bold = max(1, int(tall * rng.uniform(0.06, 0.16)))
@@ -270,7 +270,7 @@ def ornament(rng: np.random.Generator, size: Size) -> Bytes:
     return _grained(rng, pixels(canvas), 3)
 
 
-def _grained(rng: np.random.Generator, canvas: Bytes, strength: float) -> Bytes:
+def _grained(rng: np.random.Generator, canvas: np.ndarray, strength: float) -> Bytes:
     """Canvas, paper or varnish: a fine grain, and a drift of tone."""
     size = canvas.shape[0], canvas.shape[1]
     grain = strength * fractal(rng, size, 6, 3, 0.8) + 2 * strength * fractal(rng, size, max(size) / 2, 2)
@@ -284,10 +284,7 @@ def framed(rng: np.random.Generator, canvas: Bytes) -> Bytes:
     kind = rng.integers(4)
     if kind == 0:
         return canvas
-    if kind == 1:
-        border = np.full_like(canvas, rng.uniform(215, 245))
-    else:
-        border = _moulding(rng, (h, w), edge, kind == 2)
+    border = np.full_like(canvas, rng.uniform(215, 245)) if kind == 1 else _moulding(rng, (h, w), edge, kind == 2)
     border[edge : h - edge, edge : w - edge] = cv2.resize(canvas, (w - 2 * edge, h - 2 * edge), interpolation=cv2.INTER_AREA)
     return border
 

@@ -45,6 +45,11 @@ class Door:
     north: float
     height: float = 2.4
 
+    @property
+    def centre(self) -> Doubles:
+        """(2,)"""
+        return np.array([self.west + self.east, self.south + self.north]) / 2
+
 
 COURTYARD = Room("courtyard", 0.0, 0.0, 14.0, 11.0, 6.5, roofed=False)
 ROOMS = (

@@ -38,7 +38,7 @@ def expose(light: Floats, sensor: Sensor, gain: float, rng: np.random.Generator)
     blurred = _shaken(light, sensor.shake * abs(rng.normal()), rng.uniform(0, np.pi))
     focus = sensor.defocus * rng.uniform(0.5, 1.5)
     if focus > 0.1:
-        blurred = cv2.GaussianBlur(blurred, (0, 0), focus)
+        blurred = np.asarray(cv2.GaussianBlur(blurred, (0, 0), focus), np.float32)
     gain *= 2 ** rng.normal(0, MISTAKE)
     values = blurred * _vignette(light.shape[:2])[..., None] * np.float32(gain) * rng.normal(1, sensor.cast, 3).astype(np.float32)
     deviation = np.sqrt(SHOT * gain * np.maximum(values, 0) + (READ * gain) ** 2) * np.float32(sensor.noise)
@@ -57,7 +57,8 @@ def _shaken(light: Floats, length: float, turn: float) -> Floats:
     half = length / 2 * np.array([np.cos(turn), np.sin(turn)])
     ends = np.rint((np.array([-half, half]) + middle) * 16).astype(int)
     cv2.line(kernel, ends[0], ends[1], 255, 1, cv2.LINE_AA, 4)
-    return cv2.filter2D(light, -1, kernel.astype(np.float32) / float(kernel.sum()), borderType=cv2.BORDER_REPLICATE)
+    spread = kernel.astype(np.float32) / float(kernel.sum())
+    return np.asarray(cv2.filter2D(light, -1, spread, borderType=cv2.BORDER_REPLICATE), np.float32)
 
 
 def _vignette(size: tuple[int, int]) -> Floats:

@@ -176,7 +176,7 @@ def _courses(
     size: Size,
     scale: float,
     piece: tuple[float, float],
-    base: Floats,
+    base: np.ndarray,
     spread: float,
     grain: float = 1.0,
 ) -> Bytes:

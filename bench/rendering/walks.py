@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -64,7 +65,7 @@ def references(rooms: tuple[Room, ...], count: int, building: Building, seed: in
     """`count` stations, shared among the rooms by their perimeters, in the order in which they are walked, with room and lap."""
     edges = np.cumsum([0.0, *(room.perimeter for room in rooms for _ in range(LAPS))])
     numbers = np.round(edges / edges[-1] * count).astype(int)
-    for stretch, (first, last) in enumerate(zip(numbers, numbers[1:], strict=False)):
+    for stretch, (first, last) in enumerate(pairwise(numbers)):
         room, lap = rooms[stretch // LAPS], stretch % LAPS
         for number in range(first, last):
             rng = np.random.default_rng([seed, 5, number])
