@@ -2,8 +2,8 @@
 
 The poses, of all photographs with raw descriptors, are the ground truth, as they were for Aachen. Every fifth photograph is a
 query; it has no part in the map or the dictionary, which are made from references alone. Structure from motion leaves the unit
-of length open; here it is fixed by the distance of two cameras: unless two are named, those of the first photograph by name and of
-the one halfway down the list.
+of length open; here it is fixed by the distance of two cameras: unless two are named, those of the first photograph by name and
+of the one halfway down the list.
 """
 
 from __future__ import annotations

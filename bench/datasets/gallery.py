@@ -54,7 +54,7 @@ class Gallery(Dataset):
     people: float = 1.5  # in an image, on average
     blur: float = 1.0  # of queries; 1 is about a pixel
     noise: float = 1.0  # of queries; 1 is a good sensor's
-    detail: float = 1.0  # of textures; 1 is about a texel a pixel from 1.5 m away
+    detail: float = 1.0  # of textures and light; 1 is about a texel a pixel from 1.5 m away
 
     def __post_init__(self) -> None:
         if self.views < 1 or min(self.queries, self.seed) < 0 or not 1 <= self.rooms <= len(ROOMS):
@@ -110,7 +110,7 @@ def shot(gallery: Gallery, kind: Kind, index: int) -> Shot:
     night = taken.condition == "night"
     building, eye = model.building, _eye(taken)
     mine = [gallery.seed, 7, int(kind == "query"), index]
-    present = crowd.gather(np.random.default_rng([*mine, 0]), model.cast[kind], gallery.people, eye, building, night)
+    present = crowd.gather(np.random.default_rng([*mine, 0]), _cast(gallery.seed)[kind], gallery.people, eye, building, night)
     drawing = draw(eye, building.night if night else building.day, present, lambda rays: building.sky_at(rays, night))
     sensor = _sensor(gallery, kind, night)
     pixels = expose(drawing.light, sensor, metered(drawing.light), np.random.default_rng([*mine, 1]))
@@ -142,15 +142,10 @@ class _Model:
 
     gallery: Gallery
 
-    @cached_property
+    @property
     def building(self) -> Building:
         g = self.gallery
-        return build(g.seed, repeats=g.repeats, bare=g.bare, detail=g.detail)
-
-    @cached_property
-    def cast(self) -> dict[Kind, list[Person]]:
-        rngs = (np.random.default_rng([self.gallery.seed, 8, number]) for number in range(2))
-        return {"reference": cutouts.of_map(next(rngs), CAST), "query": cutouts.of_queries(next(rngs), CAST)}
+        return _building(g.seed, g.repeats, g.bare, g.detail)
 
     @cached_property
     def taken(self) -> dict[Kind, list[_Taken]]:
@@ -170,9 +165,20 @@ class _Model:
         return {"reference": references, "query": queries}
 
 
-@lru_cache(maxsize=2)  # textures are large
+@lru_cache(maxsize=8)
 def _model(gallery: Gallery) -> _Model:
     return _Model(gallery)
+
+
+@lru_cache(maxsize=2)
+def _cast(seed: int) -> dict[Kind, list[Person]]:
+    rngs = (np.random.default_rng([seed, 8, number]) for number in range(2))
+    return {"reference": cutouts.of_map(next(rngs), CAST), "query": cutouts.of_queries(next(rngs), CAST)}
+
+
+@lru_cache(maxsize=2)  # its textures are large
+def _building(seed: int, repeats: float, bare: float, detail: float) -> Building:
+    return build(seed, repeats=repeats, bare=bare, detail=detail)
 
 
 def _camera(gallery: Gallery, zoom: float) -> pycolmap.Camera:

@@ -7,6 +7,7 @@ the largest centred square is cut out and resized to 256 x 256 with Pillow's bic
 from __future__ import annotations
 
 import hashlib
+import importlib.util
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -101,26 +102,24 @@ def of_grounds() -> list[Source]:
 
 def of_people() -> list[Source]:
     """Three people, as scikit-image's and matplotlib's wheels carry them: the astronaut, the cameraman, the admiral."""
-    import matplotlib
-
-    hopper = Path(matplotlib.get_data_path()) / "sample_data" / "grace_hopper.jpg"
-    return [*_of_scikit_image("astronaut.png", "camera.png"), Source(hopper.stem, hopper)]
+    admiral = _carried("matplotlib", "mpl-data/sample_data", "grace_hopper.jpg")
+    return [*_of_scikit_image("astronaut.png", "camera.png"), *admiral]
 
 
 def _of_scikit_image(*names: str) -> list[Source]:
-    import skimage.data
-
-    return _sources(Path(skimage.data.__file__).parent, names)
+    return _carried("skimage", "data", *names)
 
 
 def _of_scikit_learn(*names: str) -> list[Source]:
-    import sklearn.datasets
-
-    return _sources(Path(sklearn.datasets.__file__).parent / "images", names)
+    return _carried("sklearn", "datasets/images", *names)
 
 
-def _sources(directory: Path, names: tuple[str, ...]) -> list[Source]:
-    return [Source(path.stem, path) for path in (directory / name for name in names)]
+def _carried(package: str, directory: str, *names: str) -> list[Source]:
+    """Files of a package that is not imported for them: that would take seconds."""
+    spec = importlib.util.find_spec(package)
+    assert spec is not None
+    assert spec.origin is not None
+    return [Source(path.stem, path) for path in (Path(spec.origin).parent / directory / name for name in names)]
 
 
 def read(path: Path) -> Photograph:

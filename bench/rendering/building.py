@@ -19,7 +19,7 @@ from bench.rendering.rooms import DOORS, ROOMS, UP, Room, Wall, walls
 from bench.types import Bytes, Floats
 
 WALL, FLOOR, PICTURE = 180.0, 160.0, 400.0  # texels a metre
-GRID = 0.35  # metres between the points where light is computed
+GRID = 0.35  # metres between the points where light is computed, at full detail
 CLEAR = 1.1  # metres around what stands in a room
 HANGING = 0.03  # metres between a wall and the face of what hangs on it
 
@@ -90,19 +90,25 @@ def build(seed: int, *, repeats: float, bare: float, detail: float) -> Building:
     ----------
     repeats : the share of pictures that hang elsewhere as well
     bare : the share of places left empty
-    detail : texels a metre, where 1 is about one a pixel from 1.5 m away
+    detail : texels a metre, where 1 is about one a pixel from 1.5 m away; below 1 light is coarser as well
     """
+    everything, standing = furnish(seed, repeats=repeats, bare=bare, detail=detail)
+    solid = [surface for surface in everything if surface.solid]
+    occluders = Occluders.of(*(np.stack([getattr(s, name) for s in solid]) for name in ("corner", "across", "down")))
+    lightings = (_by_day(), _by_night(np.random.default_rng([seed, 1])))
+    day, night = _light(everything, occluders, lightings, GRID / min(detail, 1.0))
+    sky = Texture.of(pixels(surfaces.ramp_sky(fractal(np.random.default_rng([seed, 2]), (768, 768), 160, 6))))
+    return Building(tuple(day), tuple(night), tuple(standing), occluders, lightings, sky)
+
+
+def furnish(seed: int, *, repeats: float, bare: float, detail: float) -> tuple[list[Surface], list[Footprint]]:
+    """All surfaces, without light, and what stands on the floor; the parameters are those of `build`."""
     furnished = _Furnisher(np.random.default_rng([seed, 0]), seed, repeats, bare, detail)
     indoors = iter(np.random.default_rng([seed, 4]).permutation(len(WALLS)).tolist() * 2)
     for room in ROOMS:
         furnished.room(room, WALLS[next(indoors)] if room.roofed else surfaces.stones)
     furnished.doorways()
-    solid = [surface for surface in furnished.surfaces if surface.solid]
-    occluders = Occluders.of(*(np.stack([getattr(s, name) for s in solid]) for name in ("corner", "across", "down")))
-    lightings = (_by_day(), _by_night(np.random.default_rng([seed, 1])))
-    day, night = _light(furnished.surfaces, occluders, lightings)
-    sky = Texture.of(pixels(surfaces.ramp_sky(fractal(np.random.default_rng([seed, 2]), (768, 768), 160, 6))))
-    return Building(tuple(day), tuple(night), tuple(furnished.standing), occluders, lightings, sky)
+    return furnished.surfaces, furnished.standing
 
 
 def _by_day() -> Lighting:
@@ -137,9 +143,11 @@ def _lamps(room: Room) -> list[tuple[float, float]]:
     ]
 
 
-def _light(all_surfaces: list[Surface], occluders: Occluders, lightings: tuple[Lighting, ...]) -> list[list[Quad]]:
+def _light(
+    all_surfaces: list[Surface], occluders: Occluders, lightings: tuple[Lighting, ...], spacing: float
+) -> list[list[Quad]]:
     """The surfaces as quads under each lighting."""
-    grids = [_grid(surface) for surface in all_surfaces]
+    grids = [_grid(surface, spacing) for surface in all_surfaces]
     points = np.concatenate([grid.reshape(-1, 3) for grid in grids]).astype(np.float32)
     counts = [grid.shape[0] * grid.shape[1] for grid in grids]
     normals = np.stack([np.cross(surface.down, surface.across) for surface in all_surfaces])
@@ -154,9 +162,9 @@ def _light(all_surfaces: list[Surface], occluders: Occluders, lightings: tuple[L
     ]
 
 
-def _grid(surface: Surface) -> Doubles:
+def _grid(surface: Surface, spacing: float) -> Doubles:
     """Points all over the surface. -> (h, w, 3)"""
-    w, h = (int(np.clip(np.ceil(np.linalg.norm(edge) / GRID), 2, 40)) for edge in (surface.across, surface.down))
+    w, h = (int(np.clip(np.ceil(np.linalg.norm(edge) / spacing), 2, 40)) for edge in (surface.across, surface.down))
     u, v = np.meshgrid((np.arange(w) + 0.5) / w, (np.arange(h) + 0.5) / h)  # (h, w)
     return surface.corner + u[..., None] * surface.across + v[..., None] * surface.down
 
