@@ -107,9 +107,7 @@ def _quietly() -> Iterator[None]:
 def _distance(found: dict[str, Placed], first: str, second: str) -> float:
     for name in (first, second):
         if name not in found:
-            raise UserError(
-                f"captured: {name} is to fix the unit of length, but has no pose; name another (first=..., second=...)"
-            )
+            raise UserError(f"captured: {name}, which fixes the unit of length, has no pose; name another (first=, second=)")
     a, b = (found[name][2].inverse().translation for name in (first, second))
     distance = float(np.linalg.norm(a - b))
     if distance == 0:
