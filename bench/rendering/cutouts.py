@@ -65,7 +65,8 @@ def of_map(rng: np.random.Generator, count: int) -> list[Person]:
 def of_queries(rng: np.random.Generator, count: int) -> list[Person]:
     """People who are in query views."""
     astronaut, _, admiral = (np.asarray(decode(source.path)[0]) for source in of_people())
-    busts = [_standing(rng, astronaut, ASTRONAUT, 196), _standing(rng, admiral, ADMIRAL, 140)]
+    # Each of them twice, in other trousers: theirs are the faces by which one sees what an attack recovers.
+    busts = [_standing(rng, *who) for who in ((astronaut, ASTRONAUT, 196), (admiral, ADMIRAL, 140)) for _ in range(2)]
     return busts + [drawn(rng) for _ in range(count - len(busts))]
 
 
