@@ -111,6 +111,10 @@ def test_binary_models_and_models_in_a_folder_of_their_own_are_read(original: Sc
     model.write_binary(sparse / "0")
     found = colmap.load(here["colmap"])
     assert all(same(one, other) for one, other in zip(original.references, found.references, strict=True))
+    model.cameras[2].params = [np.nan, 40, 30, 0]
+    model.write_binary(sparse / "0")
+    with pytest.raises(UserError, match=r"image 2: the pose or the intrinsics of db/1\.png are not finite"):
+        colmap.load(here["colmap"])
     (sparse / "0" / "images.bin").write_bytes((sparse / "0" / "images.bin").read_bytes()[:-30])
     with pytest.raises(UserError, match="not a whole COLMAP model"):
         colmap.load(here["colmap"])
@@ -226,6 +230,7 @@ def test_damaged_poses_are_refused(here: dict[str, Path], line: int, change: Cal
         ("images", 7, field(2, "nan"), "not all of these are finite"),
         ("images", 7, field(1, "3"), "the quaternion .* has norm 3"),
         ("images", 9, field(8, "77"), "there is no camera 77 in .*cameras.txt"),
+        ("images", 7, field(9, "db/0.png"), r"db/0\.png is in this model twice"),
         ("images", 5, field(9, "db/absent.png"), r"there is no image .*absent\.png"),
     ],
 )

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import get_args
 
+import numpy as np
 import pycolmap
 
 from bench.datasets import lists
@@ -126,11 +127,18 @@ def read_model(folder: Path) -> dict[str, Placed]:
         model = pycolmap.Reconstruction(folder)
     except (ValueError, RuntimeError) as error:
         raise UserError(f"{folder}: not a whole COLMAP model: {error}") from None
-    found = {  # copies: what pycolmap hands out lies in the model, which ends here
-        image.name: (wheres.get(image.name, f"{folder}, image {number}"), deepcopy(image.camera), image.cam_from_world())
-        for number, image in sorted(model.images.items())
-        if image.has_pose
-    }
+    found: dict[str, Placed] = {}
+    for number, image in sorted(model.images.items()):
+        where = wheres.get(image.name, f"{folder}, image {number}")
+        if not image.has_pose:
+            continue
+        if image.name in found:
+            raise UserError(f"{where}: {image.name} is in this model twice")
+        # Copies: what pycolmap hands out lies in the model, which ends here.
+        camera, pose = deepcopy(image.camera), image.cam_from_world()
+        if not (np.isfinite(pose.matrix()).all() and np.isfinite(camera.params).all()):
+            raise UserError(f"{where}: the pose or the intrinsics of {image.name} are not finite")
+        found[image.name] = where, camera, pose
     if not found:
         raise UserError(f"{folder}: no image of this model has a pose")
     return found
@@ -147,7 +155,7 @@ def _check_text(folder: Path) -> dict[str, str]:
         lists.camera(fields[1:], f"{folder / 'cameras.txt'}:{number}")
         known.add(fields[0])
     path, wheres, points = folder / "images.txt", {}, False
-    for number, line in enumerate(lists.text(path).splitlines(), 1):
+    for number, line in lists.rows(path):
         where = f"{path}:{number}"
         if points or line.startswith("#") or not line.strip():
             points = False  # the line after an image's holds its points, if any

@@ -58,27 +58,28 @@ def quaternion(cam_from_world: pycolmap.Rigid3d) -> np.ndarray:
 
 
 def lines(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """The numbers and the fields of all lines that say something.
+    """The numbers and the fields of all lines that say something, read as they are asked for: models are large.
 
     Raises
     ------
     UserError
         if there is no such file, or it is no text.
     """
-    for number, line in enumerate(text(path).splitlines(), 1):
+    for number, line in rows(path):
         fields = line.split()
         if fields and not fields[0].startswith("#"):
             yield number, fields
 
 
-def text(path: Path) -> str:
-    """The content of a text file; raises UserError if there is no such file, or it is no text."""
+def rows(path: Path) -> Iterator[tuple[int, str]]:
+    """All lines with their numbers, from 1; raises UserError if there is no such file, or it is no text."""
     if not path.is_file():
         raise UserError(f"{path}: no such file")
-    try:
-        return path.read_text(encoding="utf-8")
-    except UnicodeDecodeError as error:
-        raise UserError(f"{path}: not a text file: {error}") from None
+    with path.open(encoding="utf-8") as opened:
+        try:
+            yield from enumerate(opened, 1)
+        except UnicodeDecodeError as error:
+            raise UserError(f"{path}: not a text file: {error}") from None
 
 
 def camera(fields: Sequence[str], where: str) -> pycolmap.Camera:
