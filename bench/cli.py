@@ -24,7 +24,7 @@ BROKEN_PIPE = 141  # as a shell reports a program that SIGPIPE ended
 GO_ON = "what was written is kept; run the same command again to go on"
 PIPED_WIDTH = 400  # columns of a table that goes to a file: its cells are not folded, so that they can be searched
 
-COMMANDS = ("run", "list", "dictionary", "train")
+COMMANDS = ("run", "list", "dictionary", "train", "dataset")
 
 EXAMPLES = """examples:
   bench run --defense ldp --attack dia
@@ -32,6 +32,7 @@ EXAMPLES = """examples:
   bench list
   bench dictionary build --images DIR --size 256000 --out K.safetensors
   bench train --defense ldp --images DIR --out W.safetensors
+  bench dataset gallery --layout colmap --out DIR
 
 exit status: 0 done, 1 some photograph failed (all else is done and written), 2 a mistake in what was asked (nothing is written)
 """
@@ -74,7 +75,7 @@ def _command(argv: list[str]) -> int:
     _check_commands(argv)
     args, extra = _parser().parse_known_args(argv)
     if "command" not in args:
-        raise UserError("say what to do: run, list, dictionary build or train (bench --help explains)")
+        raise UserError("say what to do: run, list, dictionary build, train or dataset (bench --help explains)")
     if extra:
         option = extra[0].partition("=")[0]
         if option.startswith("-"):
@@ -171,6 +172,15 @@ def _parser() -> argparse.ArgumentParser:
     train.add_argument("--seed", type=_whole, default=0, metavar="N", help="of the training (default: %(default)s)")
     train.add_argument("--extractor", metavar="SPEC", default="sift", help="what makes the features (default: %(default)s)")
     train.set_defaults(command=_train, required=("defense", "images", "out"), options=train.format_help())
+
+    dataset = add(commands, "dataset", "write a dataset, such as the gallery, into a folder that other programs can read")
+    dataset.add_argument("dataset", nargs="?", metavar="SPEC", help="name:field=value,... (bench list datasets)")
+    dataset.add_argument("--layout", metavar="aachen|colmap", help="how the folder is laid out")
+    dataset.add_argument("--out", type=Path, metavar="DIR", help="a new folder")
+    dataset.add_argument("--views", type=_whole, metavar="N", help="reference images; short for the field of that name")
+    dataset.add_argument("--queries", type=_whole, metavar="N", help="queries; likewise")
+    dataset.add_argument("--seed", type=_whole, metavar="N", help="of everything random; likewise")
+    dataset.set_defaults(command=_dataset, required=("dataset", "layout", "out"), options=dataset.format_help())
     return parser
 
 
@@ -256,6 +266,21 @@ def _train(args: argparse.Namespace) -> int:
     )
     scores = ", ".join(f"{name} {value:.4g}" for name, value in meta["validation"].items())
     print(f"{args.out}: {meta['crops']} crops of {meta['photographs']} photographs; validation: {scores}")
+    return DONE
+
+
+def _dataset(args: argparse.Namespace) -> int:
+    from bench import registry, spec
+    from bench.datasets import export
+
+    plugin, given = spec.parse(args.dataset, registry.DATASET)
+    for name in ("views", "queries", "seed"):
+        value = getattr(args, name)
+        if value is not None:
+            given |= spec.parse(f"{plugin.name()}:{name}={value}", registry.DATASET)[1]
+    scene = spec.build(plugin, given).scene()
+    export.write(scene, args.layout, args.out)
+    print(f"{args.out}: {len(scene.references)} references and {len(scene.queries)} queries of {scene.name}, as {args.layout}")
     return DONE
 
 

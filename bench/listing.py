@@ -20,6 +20,7 @@ SECTIONS: dict[str, Kind] = {
     "attacks": registry.ATTACK,
     "metrics": registry.METRIC,
     "tasks": registry.TASK,
+    "datasets": registry.DATASET,
     "extractors": registry.EXTRACTOR,
 }
 

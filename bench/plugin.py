@@ -14,6 +14,7 @@ from bench.types import Bytes, Features, Floats, Knowledge, Release, Subspaces
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from bench.datasets.scene import Scene
     from bench.public import Public
 
 
@@ -188,6 +189,20 @@ class Metric(Plugin, ABC):
     @abstractmethod
     def __call__(self, truth: Floats, estimate: Floats) -> float | None:
         """Images are (H, W, 3) in [0, 1]; descriptors are (N, D). None where the value is not finite."""
+
+
+class Dataset(Plugin, ABC):
+    """A place that was photographed, for tasks that need to know where."""
+
+    @abstractmethod
+    def scene(self) -> Scene:
+        """Return the scene; its images are read when they are asked for.
+
+        Raises
+        ------
+        UserError
+            naming file and line, if something of it is missing or damaged.
+        """
 
 
 class Extractor(Plugin, ABC):

@@ -19,7 +19,7 @@ from typing import Any, Generic, TypeVar
 
 from bench import fields
 from bench.errors import UserError, unknown
-from bench.plugin import Defense, DescriptorAttack, Extractor, ImageAttack, Metric, Plugin, Task
+from bench.plugin import Dataset, Defense, DescriptorAttack, Extractor, ImageAttack, Metric, Plugin, Task
 
 P = TypeVar("P", bound=Plugin)
 
@@ -38,6 +38,7 @@ DEFENSE = Kind("defense", "defenses", "feature_privacy.defenses", (Defense,))
 ATTACK = Kind[DescriptorAttack | ImageAttack]("attack", "attacks", "feature_privacy.attacks", (DescriptorAttack, ImageAttack))
 METRIC = Kind("metric", "metrics", "feature_privacy.metrics", (Metric,))
 TASK = Kind("task", "bench.tasks", "feature_privacy.tasks", (Task,))
+DATASET = Kind("dataset", "bench.datasets", "feature_privacy.datasets", (Dataset,))
 EXTRACTOR = Kind("extractor", "bench.features", "feature_privacy.extractors", (Extractor,))
 
 

@@ -3,8 +3,12 @@
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 from PIL import Image, ImageFilter
+from scipy.spatial.transform import Rotation
+
+from bench.datasets.scene import File, Reference, Scene, SceneImage
 
 FAKES = {
     "feature_privacy.attacks": {"painter": "fake_plugins.painter:PLUGIN", "guess": "fake_plugins.guess:PLUGIN"},
@@ -34,3 +38,26 @@ def album(folder: Path, count: int = 2) -> Path:
     for number in range(count):
         texture(number).save(folder / f"{number}.png")
     return folder
+
+
+def scene(folder: Path, references: int = 3, queries: int = 4) -> Scene:
+    """Blurred noise by cameras at random places; the second half of the queries is by night."""
+    rng = np.random.default_rng(7)
+
+    def image(name: str, focal: float) -> dict:
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        texture(int(rng.integers(1000))).save(path)
+        camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", focal, 80, 64)
+        camera.params = [focal, 40.25, 31.5, 0.0123456789012345]
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(Rotation.random(random_state=rng).as_quat()), rng.normal(0, 20, 3))
+        return {"name": name, "camera": camera, "cam_from_world": pose, "pixels": File(path=path, size=(80, 64))}
+
+    return Scene(
+        name="noise",
+        references=tuple(Reference(**image(f"db/{i}.png", 70.0 + i % 2), condition="day") for i in range(references)),
+        queries=tuple(
+            SceneImage(**image(f"query/{when}/{i}.png", 75.1), condition=when)
+            for i, when in enumerate(["day"] * (queries - queries // 2) + ["night"] * (queries // 2))
+        ),
+    )

@@ -14,6 +14,8 @@ from fake_plugins.painter import Painter
 from fakes import FAKES, album, install
 
 from bench import cli, registry
+from bench.datasets import colmap
+from bench.datasets.gallery import Gallery
 from bench.plugin import View
 from bench.records import Log
 from bench.testing import small_dictionary
@@ -233,3 +235,42 @@ def test_nothing_is_asked_of_the_terminal_when_there_is_none(tmp_path: Path) -> 
         [sys.executable, "-m", "bench.cli", "--version"], capture_output=True, env=environment, cwd=tmp_path, check=True
     )
     assert ended.stderr == b""
+
+
+def test_dataset_is_written_in_a_layout(bench: Bench) -> None:
+    tiny = "gallery:width=64,height=48,detail=0.1"
+    status, shown, _ = bench("dataset", tiny, "--views", 2, "--queries", 2, "--seed", 3, "--layout", "colmap", "--out", "x")
+    assert status == 0
+    assert shown == "x: 2 references and 2 queries of gallery, as colmap\n"
+    written = colmap.load(Path("x"))
+    expected = Gallery(width=64, height=48, detail=0.1, views=2, queries=2, seed=3).scene()
+    np.testing.assert_array_equal(written.queries[1].pixels.read(), expected.queries[1].pixels.read())
+    mask, drawn = written.queries[1].pixels.foreground(), expected.queries[1].pixels.foreground()
+    assert mask is not None
+    assert drawn is not None
+    np.testing.assert_array_equal(mask, drawn)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (("galery", "--layout", "colmap", "--out", "x"), "unknown dataset 'galery'; did you mean 'gallery'"),
+        (("gallery", "--layout", "colmap"), "--out is missing"),
+        (("gallery", "--out", "x"), "--layout is missing"),
+        (("gallery:view=2", "--layout", "colmap", "--out", "x"), "unknown field of gallery 'view'; did you mean 'views'"),
+        (("gallery", "--views", "0", "--layout", "colmap", "--out", "x"), "at least one view"),
+        (("colmap", "--layout", "colmap", "--out", "x"), "colmap needs path"),
+        (("colmap:path=absent", "--layout", "colmap", "--out", "x"), "absent: no such folder"),
+        (("colmap:path=a", "--views", "2", "--layout", "colmap", "--out", "x"), "unknown field of colmap 'views'"),
+        (
+            ("gallery:width=64,height=48,detail=0.1", "--views", "1", "--layout", "colmp", "--out", "x"),
+            "--layout colmp: there is",
+        ),
+    ],
+)
+def test_mistakes_about_datasets(bench: Bench, arguments: tuple[str, ...], complaint: str) -> None:
+    status, shown, told = bench("dataset", *arguments)
+    assert status == 2
+    assert shown == ""
+    assert complaint in told
+    assert not Path("x").exists()

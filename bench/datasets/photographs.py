@@ -7,6 +7,7 @@ the largest centred square is cut out and resized to 256 x 256 with Pillow's bic
 from __future__ import annotations
 
 import hashlib
+import importlib.util
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -83,14 +84,42 @@ def held_out(sources: list[Source], chosen: Path | None) -> tuple[list[Source], 
 
 def builtin() -> list[Source]:
     """The seven colour photographs that scikit-image and scikit-learn carry in their wheels."""
-    import skimage.data
-    import sklearn.datasets
+    names = ("astronaut.png", "chelsea.png", "coffee.png", "rocket.jpg", "motorcycle_left.png")
+    return [*_of_scikit_image(*names), *_of_scikit_learn("china.jpg", "flower.jpg")]
 
-    scikit_image = Path(skimage.data.__file__).parent
-    scikit_learn = Path(sklearn.datasets.__file__).parent / "images"
-    names = ["astronaut.png", "chelsea.png", "coffee.png", "rocket.jpg", "motorcycle_left.png"]
-    files = [scikit_image / name for name in names] + [scikit_learn / name for name in ("china.jpg", "flower.jpg")]
-    return [Source(path.stem, path) for path in files]
+
+def of_things() -> list[Source]:
+    """Pictures that the libraries' wheels carry and that show nobody."""
+    first = ("chelsea.png", "coffee.png", "rocket.jpg", "motorcycle_left.png", "coins.png", "hubble_deep_field.jpg")
+    others = ("ihc.png", "moon.png", "page.png", "retina.jpg", "text.png", "logo.png")
+    return [*_of_scikit_image(*first, *others), *_of_scikit_learn("china.jpg", "flower.jpg")]
+
+
+def of_grounds() -> list[Source]:
+    """Grass, gravel and bricks, as scikit-image's wheel carries them."""
+    return _of_scikit_image("grass.png", "gravel.png", "brick.png")
+
+
+def of_people() -> list[Source]:
+    """Three people, as scikit-image's and matplotlib's wheels carry them: the astronaut, the cameraman, the admiral."""
+    admiral = _carried("matplotlib", "mpl-data/sample_data", "grace_hopper.jpg")
+    return [*_of_scikit_image("astronaut.png", "camera.png"), *admiral]
+
+
+def _of_scikit_image(*names: str) -> list[Source]:
+    return _carried("skimage", "data", *names)
+
+
+def _of_scikit_learn(*names: str) -> list[Source]:
+    return _carried("sklearn", "datasets/images", *names)
+
+
+def _carried(package: str, directory: str, *names: str) -> list[Source]:
+    """Files of a package that is not imported for them: that would take seconds."""
+    spec = importlib.util.find_spec(package)
+    assert spec is not None
+    assert spec.origin is not None
+    return [Source(path.stem, path) for path in (Path(spec.origin).parent / directory / name for name in names)]
 
 
 def read(path: Path) -> Photograph:
@@ -105,12 +134,12 @@ def read(path: Path) -> Photograph:
     return Photograph(square(image, SIDE), notes)
 
 
-def decode(path: Path) -> tuple[Image.Image, tuple[str, ...]]:
-    """Return an upright 8-bit RGB image of the file's own size, and notes on what was converted."""
+def decode(path: Path, upright: bool = True) -> tuple[Image.Image, tuple[str, ...]]:
+    """Return an 8-bit RGB image of the file's own size, and notes on what was converted. `upright` applies EXIF rotation."""
     try:
         with Image.open(path) as opened:
             opened.load()
-            image = ImageOps.exif_transpose(opened)
+            image = ImageOps.exif_transpose(opened) if upright else opened
     except Image.DecompressionBombError as error:
         raise UnitError(f"{path.name}: too many pixels to be read safely ({error})") from error
     except (OSError, SyntaxError, ValueError) as error:

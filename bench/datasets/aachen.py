@@ -1,0 +1,156 @@
+"""Aachen Day-Night, versions 1 and 1.1, as downloaded (Sattler et al., CVPR 2018; Zhang et al., IJCV 2020), and for its server.
+
+    images/images_upright/ or images_upright/   references and queries
+    3D-models/                                  v1: aachen_cvpr2018_db.nvm, here or in aachen_v_1/, with database_intrinsics.txt;
+                                                v1.1: aachen_v_1_1/, a COLMAP model, or an NVM with database_intrinsics_v1_1.txt
+    queries/{day,night}_time_queries_with_intrinsics*.txt
+
+The poses of its queries are withheld. A file ground_truth.txt, which the download does not have, is read where it is: the gallery
+writes this layout too.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+import pycolmap
+
+from bench.datasets import colmap, lists, nvm
+from bench.datasets.colmap import Placed
+from bench.datasets.scene import Condition, Scene
+from bench.errors import UserError
+from bench.plugin import Dataset
+
+Version = Literal["v1", "v1.1"]
+
+MODELS: Mapping[Version, tuple[str, ...]] = {
+    "v1": ("aachen_v_1/aachen_cvpr2018_db.nvm", "aachen_cvpr2018_db.nvm"),
+    "v1.1": ("aachen_v_1_1", "aachen_v_1_1/aachen_v_1_1.nvm"),
+}
+INTRINSICS = "database_intrinsics*.txt"  # beside the NVM
+QUERIES = "{}_time_queries_with_intrinsics*.txt"
+LATER = re.compile(r"v?1[._]1\.txt$")  # how a list of version 1.1 is named
+
+
+@dataclass(frozen=True, kw_only=True)
+class Aachen(Dataset):
+    """Aachen Day-Night as downloaded."""
+
+    path: Path
+    version: Version | None = None  # needed where both are there
+
+    def scene(self) -> Scene:
+        return load(self.path, self.version)
+
+
+def load(root: Path, version: Version | None = None) -> Scene:
+    """Read the download.
+
+    `version` says which of two is meant where both are there; a list of queries that only one name stands for serves both.
+
+    Raises
+    ------
+    UserError
+        naming file and line, if something is missing, damaged, or there in both versions and none was asked for.
+    """
+    if not root.is_dir():
+        raise UserError(f"{root}: no such folder")
+    upright = [folder for folder in (root / "images" / "images_upright", root / "images_upright") if folder.is_dir()]
+    if not upright:
+        raise UserError(f"{root}: neither images_upright/ nor images/images_upright/ is there")
+    return colmap.assemble(
+        "aachen",
+        references=_references(root, version),
+        queries={condition: _queries(root, condition, version) for condition in get_args(Condition)},
+        images=upright[0],
+        ground_truth=colmap.ground_truth(root),
+        masks=root / "foreground",
+    )
+
+
+def write_evaluation(folder: Path, method: str, poses: Mapping[str, pycolmap.Rigid3d | None]) -> tuple[Path, int]:
+    """Write `Aachen_eval_[method].txt` for the evaluation server.
+
+    Parameters
+    ----------
+    poses : camera from world of each query, by its name; None if it was not localized, which leaves it out
+
+    Returns
+    -------
+    The file, and how many queries were left out.
+
+    Raises
+    ------
+    UserError
+        if the method's name cannot be a file's, or two queries have one basename.
+    """
+    if not re.fullmatch(r"[\w.+-]+", method):
+        raise UserError(f"method {method!r}: only letters, digits and . _ + - may be in it")
+    by_base: dict[str, pycolmap.Rigid3d | None] = {}
+    for name, pose in poses.items():
+        base = name.rpartition("/")[2]
+        if base in by_base:
+            raise UserError(f"{name}: another query is called {base} as well, and the server tells them by that")
+        by_base[base] = pose
+    path = folder / f"Aachen_eval_{method}.txt"
+    found = {base: pose for base, pose in by_base.items() if pose is not None}
+    lists.write_poses(path, found)
+    return path, len(poses) - len(found)
+
+
+def _references(root: Path, version: Version | None) -> dict[str, Placed]:
+    folder = root / "3D-models"
+    there = [
+        (number, path)
+        for number, names in MODELS.items()
+        if version in (None, number)
+        for path in [next((folder / name for name in names if _is_model(folder / name)), None)]
+        if path is not None
+    ]
+    if not there:
+        raise UserError(f"{folder}: no model of Aachen {version or 'v1 or v1.1'}; see the head of bench/datasets/aachen.py")
+    if len(there) > 1:
+        raise UserError(f"{folder}: models of both versions are there; say which, v1 or v1.1")
+    path = there[0][1]
+    return colmap.read_model(path) if path.is_dir() else _from_nvm(path)
+
+
+def _is_model(path: Path) -> bool:
+    return path.is_file() if path.suffix == ".nvm" else colmap.is_model(path)
+
+
+def _from_nvm(path: Path) -> dict[str, Placed]:
+    """The NVM's poses with the intrinsics beside it."""
+    beside = sorted(path.parent.glob(INTRINSICS))
+    if len(beside) != 1:
+        raise UserError(f"{path.parent}: {len(beside)} files {INTRINSICS} beside {path.name}; expected one")
+    cameras = lists.read_intrinsics(beside[0])
+    found = {}
+    for name, (line, pose) in nvm.read(path).items():
+        key = name.removeprefix("./")
+        if key not in cameras:
+            raise UserError(f"{path}:{line}: {name} has no intrinsics in {beside[0]}")
+        found[key] = f"{path}:{line}", cameras[key][1], pose
+    return found
+
+
+def _queries(root: Path, condition: Condition, version: Version | None) -> Path:
+    """The one list of queries of that condition and version."""
+    folder, pattern = root / "queries", QUERIES.format(condition)
+    there = sorted(folder.glob(pattern))
+    if not there:
+        raise UserError(f"{folder / pattern}: no such file")
+    if len(there) > 1 and version is None:
+        raise UserError(f"{folder}: {' and '.join(path.name for path in there)} are both there; say which version, v1 or v1.1")
+    if len(there) > 1:
+        there = [path for path in there if bool(LATER.search(path.name)) == (version == "v1.1")]
+    if len(there) != 1:
+        raise UserError(f"{folder / pattern}: cannot tell which of these lists is of version {version}")
+    return there[0]
+
+
+PLUGIN = Aachen

@@ -1,0 +1,189 @@
+"""Any COLMAP model as a scene: its images are the references; queries stand in lists with intrinsics.
+
+A folder is expected to hold
+
+    images/                                     references and queries
+    sparse/ or sparse/0/                        the model, as text or binary
+    queries/{day,night}_queries_with_intrinsics.txt    either or both
+    ground_truth.txt                            if there is some: poses of the queries, or a folder of that name with a model
+    foreground/                                 if there are some: masks by the images' names, white where something moves
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from copy import deepcopy
+from dataclasses import dataclass
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import pycolmap
+
+from bench.datasets import lists
+from bench.datasets.scene import Condition, File, Reference, Scene, SceneImage
+from bench.errors import UserError
+from bench.plugin import Dataset
+
+PARTS = ("cameras", "images", "points3D")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Colmap(Dataset):
+    """A folder with a COLMAP model, its images, and lists of queries."""
+
+    path: Path
+
+    def scene(self) -> Scene:
+        return load(self.path)
+
+
+def load(root: Path) -> Scene:
+    """Read a folder that is laid out as above.
+
+    Raises
+    ------
+    UserError
+        naming file and line, if something is missing or damaged.
+    """
+    if not root.is_dir():
+        raise UserError(f"{root}: no such folder")
+    models = [folder for folder in (root / "sparse", root / "sparse" / "0") if is_model(folder)]
+    if not models:
+        raise UserError(f"{root / 'sparse'}: no COLMAP model (cameras, images and points3D, .txt or .bin)")
+    listed: dict[Condition, Path] = {condition: queries_list(root, condition) for condition in get_args(Condition)}
+    present = {condition: path for condition, path in listed.items() if path.is_file()}
+    if not present:
+        raise UserError(f"{root / 'queries'}: no list of queries; expected {' or '.join(path.name for path in listed.values())}")
+    return assemble(
+        root.name,
+        references=read_model(models[0]),
+        queries=present,
+        images=root / "images",
+        ground_truth=ground_truth(root),
+        masks=root / "foreground",
+    )
+
+
+def queries_list(root: Path, condition: Condition) -> Path:
+    return root / "queries" / f"{condition}_queries_with_intrinsics.txt"
+
+
+def ground_truth(root: Path) -> Path | None:
+    """Where the poses of the queries are, if they are there."""
+    return next((path for path in (root / "ground_truth.txt", root / "ground_truth") if path.exists()), None)
+
+
+Placed = tuple[str, pycolmap.Camera, pycolmap.Rigid3d]  # where it stands, for messages; intrinsics; camera from world
+
+
+def assemble(
+    name: str,
+    *,
+    references: Mapping[str, Placed],
+    queries: Mapping[Condition, Path],
+    images: Path,
+    ground_truth: Path | None = None,
+    masks: Path | None = None,
+) -> Scene:
+    """Put a scene together from references, lists of queries and the folder of all images.
+
+    Raises
+    ------
+    UserError
+        naming file and line, if a list is damaged, an image is missing, a name stands for two images, or a pose belongs to none.
+    """
+    poses = {} if ground_truth is None else _poses(ground_truth)
+    shown = [
+        Reference(
+            name=name, camera=camera, cam_from_world=pose, condition="day", pixels=_file(name, where, camera, images, masks)
+        )
+        for name, (where, camera, pose) in sorted(references.items())
+    ]
+    asked: dict[str, SceneImage] = {}
+    for condition, path in queries.items():
+        for query, (line, camera) in lists.read_intrinsics(path).items():
+            where = f"{path}:{line}"
+            if query in references or query in asked:
+                raise UserError(f"{where}: {query} is {'a reference' if query in references else 'in another list'} as well")
+            pixels, pose = _file(query, where, camera, images, masks), poses.pop(query, (where, None))[1]
+            asked[query] = SceneImage(name=query, camera=camera, cam_from_world=pose, condition=condition, pixels=pixels)
+    if poses:
+        stray, (where, _) = next(iter(poses.items()))
+        raise UserError(f"{where}: a pose of {stray}, which is no query")
+    return Scene(name=name, references=tuple(shown), queries=tuple(asked.values()))
+
+
+def read_model(folder: Path) -> dict[str, Placed]:
+    """The images of a COLMAP model that have a pose.
+
+    Raises
+    ------
+    UserError
+        naming file and, for text, line, if the model is damaged or holds no pose.
+    """
+    wheres = _check_text(folder) if (folder / "images.txt").is_file() else {}
+    try:
+        model = pycolmap.Reconstruction(folder)
+    except (ValueError, RuntimeError) as error:
+        raise UserError(f"{folder}: not a whole COLMAP model: {error}") from None
+    found: dict[str, Placed] = {}
+    for number, image in sorted(model.images.items()):
+        where = wheres.get(image.name, f"{folder}, image {number}")
+        if not image.has_pose:
+            continue
+        if image.name in found:
+            raise UserError(f"{where}: {image.name} is in this model twice")
+        # Copies: what pycolmap hands out lies in the model, which ends here.
+        camera, pose = deepcopy(image.camera), image.cam_from_world()
+        if not (np.isfinite(pose.matrix()).all() and np.isfinite(camera.params).all()):
+            raise UserError(f"{where}: the pose or the intrinsics of {image.name} are not finite")
+        found[image.name] = where, camera, pose
+    if not found:
+        raise UserError(f"{folder}: no image of this model has a pose")
+    return found
+
+
+def is_model(folder: Path) -> bool:
+    return any(all((folder / f"{part}.{suffix}").is_file() for part in PARTS) for suffix in ("txt", "bin"))
+
+
+def _check_text(folder: Path) -> dict[str, str]:
+    """Check what pycolmap would take or refuse without saying where. -> each image's file and line"""
+    known = set()
+    for number, fields in lists.lines(folder / "cameras.txt"):
+        lists.camera(fields[1:], f"{folder / 'cameras.txt'}:{number}")
+        known.add(fields[0])
+    path, wheres, points = folder / "images.txt", {}, False
+    for number, line in lists.rows(path):
+        where = f"{path}:{number}"
+        if points or line.startswith("#") or not line.strip():
+            points = False  # the line after an image's holds its points, if any
+            continue
+        fields = line.split()
+        if len(fields) != 10:
+            raise UserError(f"{where}: an image has 10 fields (id qw qx qy qz tx ty tz camera name), but there are {len(fields)}")
+        lists.pose(fields[1:8], where)
+        if fields[8] not in known:
+            raise UserError(f"{where}: there is no camera {fields[8]} in {folder / 'cameras.txt'}")
+        wheres[fields[9]] = where
+        points = True
+    return wheres
+
+
+def _poses(path: Path) -> dict[str, tuple[str, pycolmap.Rigid3d]]:
+    """Name -> where it stands, and camera from world, from a list of poses or a model."""
+    if path.is_dir():
+        return {name: (where, pose) for name, (where, _, pose) in read_model(path).items()}
+    return {name: (f"{path}:{line}", pose) for name, (line, pose) in lists.read_poses(path).items()}
+
+
+def _file(name: str, where: str, camera: pycolmap.Camera, images: Path, masks: Path | None) -> File:
+    path = images / name
+    if not path.is_file():
+        raise UserError(f"{where}: there is no image {path}")
+    mask = None if masks is None else (masks / name).with_suffix(".png")
+    return File(path=path, size=(camera.width, camera.height), mask=mask if mask is not None and mask.is_file() else None)
+
+
+PLUGIN = Colmap

@@ -1,0 +1,1 @@
+"""Pictures of flat textured surfaces, from cameras whose poses are exact."""
