@@ -1,10 +1,16 @@
 """Plugins and photographs that are made up for tests."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image, ImageFilter
+
+from bench.features.sift import Sift
+from bench.plugin import Defense, Trial
+from bench.public import Public
+from bench.types import Features, Release
 
 FAKES = {
     "feature_privacy.attacks": {"painter": "fake_plugins.painter:PLUGIN", "guess": "fake_plugins.guess:PLUGIN"},
@@ -34,3 +40,21 @@ def album(folder: Path, count: int = 2) -> Path:
     for number in range(count):
         texture(number).save(folder / f"{number}.png")
     return folder
+
+
+def trial(defense: Defense, secret: Features, *, rng: np.random.Generator | None = None, others: Sequence[Release] = ()) -> Trial:
+    """A trial of a task that judges the release itself, of features without a photograph."""
+    public = Public()
+    return Trial(
+        pixels=np.zeros((*secret.size[::-1], 3), dtype=np.uint8),
+        secret=secret,
+        release=defense.protect(secret, public, np.random.default_rng(1)),
+        defense=defense,
+        attack=None,
+        extractor=Sift(),
+        public=public,
+        metrics=(),
+        rng=rng or np.random.default_rng(2),
+        others=lambda count: iter(others[:count]),
+        repeats=(),
+    )
