@@ -24,7 +24,7 @@ BROKEN_PIPE = 141  # as a shell reports a program that SIGPIPE ended
 GO_ON = "what was written is kept; run the same command again to go on"
 PIPED_WIDTH = 400  # columns of a table that goes to a file: its cells are not folded, so that they can be searched
 
-COMMANDS = ("run", "list", "dictionary", "train", "dataset")
+COMMANDS = ("run", "list", "reproduce", "dictionary", "train", "dataset")
 
 EXAMPLES = """examples:
   bench run --defense ldp --attack dia
@@ -33,6 +33,7 @@ EXAMPLES = """examples:
   bench dictionary build --images DIR --size 256000 --out K.safetensors
   bench train --defense ldp --images DIR --out W.safetensors
   bench dataset gallery --layout colmap --out DIR
+  bench reproduce table1
 
 exit status: 0 done, 1 some photograph failed (all else is done and written), 2 a mistake in what was asked (nothing is written)
 """
@@ -42,6 +43,13 @@ Repeated options make a grid.
 examples:
   bench run --defense ldp --attack dia
   bench run --defense none --defense ldp:epsilon=inf --attack dia --extractor sift:upright=false --images DIR --json
+"""
+REPRODUCE_EXAMPLES = """Tables come with intervals over the photographs, and with a verdict on each claim of the paper.
+
+examples:
+  bench reproduce table1
+  bench reproduce table4 --images DIR --out runs/test
+  bench reproduce figures --profile smoke
 """
 
 
@@ -75,7 +83,7 @@ def _command(argv: list[str]) -> int:
     _check_commands(argv)
     args, extra = _parser().parse_known_args(argv)
     if "command" not in args:
-        raise UserError("say what to do: run, list, dictionary build, train or dataset (bench --help explains)")
+        raise UserError("say what to do: run, list, reproduce, dictionary build, train or dataset (bench --help explains)")
     if extra:
         option = extra[0].partition("=")[0]
         if option.startswith("-"):
@@ -181,6 +189,25 @@ def _parser() -> argparse.ArgumentParser:
     dataset.add_argument("--queries", type=_whole, metavar="N", help="queries; likewise")
     dataset.add_argument("--seed", type=_whole, metavar="N", help="of everything random; likewise")
     dataset.set_defaults(command=_dataset, required=("dataset", "layout", "out"), options=dataset.format_help())
+    reproduce = add(commands, "reproduce", "rebuild a table of the paper, or its figures, beside the paper's", REPRODUCE_EXAMPLES)
+    reproduce.add_argument("what", nargs="?", metavar="NAME", help="table1, table4, tableS3, tableS4, figures, ...")
+    reproduce.add_argument(
+        "--profile", metavar="NAME", default="cpu", help="smoke, cpu or paper: the sizes (default: %(default)s)"
+    )
+    reproduce.add_argument("--images", type=Path, metavar="DIR", help="a folder of photographs (default: the built-in ones)")
+    reproduce.add_argument("--extractor", metavar="SPEC", default="sift", help="what makes the features (default: %(default)s)")
+    reproduce.add_argument("--seed", type=_whole, default=0, metavar="N", help="of everything random (default: %(default)s)")
+    reproduce.add_argument(
+        "--out", type=Path, metavar="DIR", help="folder for the results; resumed if it exists (default: in runs/)"
+    )
+    reproduce.add_argument("--dictionary", metavar="FILE", help="K of LDP-Feat (default: the shipped one)")
+    reproduce.add_argument("--database", metavar="FILE", help="W of affine lifting (default: the shipped one)")
+    reproduce.add_argument("--public-database", metavar="FILE", help="Z, the attacker's own (default: the shipped one)")
+    for network, defense in (("raw", "none"), ("affine", "affine"), ("ldp", "ldp")):
+        reproduce.add_argument(
+            f"--{network}-network", metavar="FILE", help=f"weights trained for `{defense}` (default: shipped ones)"
+        )
+    reproduce.set_defaults(command=_reproduce, required=("what",), options=reproduce.format_help())
     return parser
 
 
@@ -282,6 +309,25 @@ def _dataset(args: argparse.Namespace) -> int:
     export.write(scene, args.layout, args.out)
     print(f"{args.out}: {len(scene.references)} references and {len(scene.queries)} queries of {scene.name}, as {args.layout}")
     return DONE
+
+
+def _reproduce(args: argparse.Namespace) -> int:
+    from bench import registry, spec
+    from leaderboard import reproduce
+
+    materials = {name: getattr(args, name) for name in reproduce.materials() if getattr(args, name)}
+    done = reproduce.reproduce(
+        args.what,
+        args.profile,
+        images=args.images,
+        extractor=spec.read(args.extractor, registry.EXTRACTOR),
+        seed=args.seed,
+        out=args.out,
+        materials=materials,
+    )
+    _print_rich(*done.shown)
+    _say(DONE, f"written to {done.out}")
+    return FAILED if done.failed else DONE
 
 
 def _check_attacks(task: Task, attacks: list[str] | None) -> None:

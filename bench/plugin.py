@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, final
 
 import numpy as np
 
-from bench.types import Bytes, Features, Floats, Knowledge, Release, Subspaces
+from bench.types import Bytes, Features, Floats, Indices, Knowledge, Release, Subspaces
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -97,6 +97,14 @@ class Defense(Plugin, ABC):
         """What is promised of one descriptor, and where it can be computed, the chance that it is told."""
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Lifted:
+    """A release of subspaces beside what only its owner knows of it."""
+
+    release: Subspaces
+    words: Indices  # (N, adversarial) rows of the defense's `database` that each subspace goes through
+
+
 class Lifting(Defense):
     """A defense that hides each descriptor in a subspace, and may lead it through words of a database on purpose.
 
@@ -109,6 +117,14 @@ class Lifting(Defense):
     @abstractmethod
     def adversarial(self) -> int:
         """Words of the database that a subspace goes through."""
+
+    @abstractmethod
+    def lifted(self, secret: Features, public: Public, rng: np.random.Generator) -> Lifted:
+        """Make the release of `protect`, and tell which words it goes through."""
+
+    @final
+    def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> Subspaces:
+        return self.lifted(secret, public, rng).release
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

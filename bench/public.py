@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from bench.errors import UserError
@@ -27,11 +27,17 @@ class Public:
     ----------
     quantiser : finds the nearest words of (N, D) rows in a dictionary
     remembered : number of photographs whose quantisation is kept
+    known : dictionaries by name that are in no file
     """
 
-    def __init__(self, quantiser: Quantiser = lambda known, rows: known.index.nearest(rows), remembered: int = 64) -> None:
+    def __init__(
+        self,
+        quantiser: Quantiser = lambda known, rows: known.index.nearest(rows),
+        remembered: int = 64,
+        known: Mapping[str, Dictionary] | None = None,
+    ) -> None:
         self._quantiser = quantiser
-        self._dictionaries: dict[tuple[str, int], Dictionary] = {}
+        self._dictionaries = {(name, 0): dictionary for name, dictionary in (known or {}).items()}
         self._quantised: OrderedDict[str, Indices] = OrderedDict()
         self._remembered = remembered
 

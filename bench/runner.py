@@ -34,7 +34,7 @@ from bench.tasks.reconstruction import Reconstruction
 from bench.types import Features, Floats, Release
 
 ERRORS = "errors.log"
-Images = Path | str | Sequence[Path | str] | None
+Images = Path | str | Sequence[Path | str | Source] | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +87,7 @@ def run(
     Parameters
     ----------
     defenses, attacks : plugins, such as `[LDP(epsilon=10)]` and `[DIA()]`
-    images : a folder, files, or None for the built-in photographs
+    images : a folder, files or sources, or None for the built-in photographs
     extractor : `Sift()` if None
     task : `Reconstruction()` if None
     seed : of everything random. A release whose seed is known is for measuring and protects nobody.
@@ -119,13 +119,33 @@ def prepare(
         if something is wrong with it, or no pair of it applies.
     """
     task = task or Reconstruction()
-    extractor = extractor or Sift()
     if not defenses:
         raise UserError("no defense was given")
     if task.attacked and not attacks:
         raise UserError(f"{task.name()} needs an attack")
     if not task.attacked and attacks:
         raise UserError(f"{task.name()} judges the release itself and takes no attack")
+    tried: Sequence[Attack | None] = attacks or [None]
+    pairs = [(defense, attack) for defense in defenses for attack in tried]
+    return prepare_pairs(pairs, images, extractor=extractor, task=task, seed=seed)
+
+
+def prepare_pairs(
+    pairs: Sequence[tuple[Defense, Attack | None]],
+    images: Images = None,
+    *,
+    task: Task,
+    extractor: Extractor | None = None,
+    seed: int = 0,
+) -> Plan:
+    """As `prepare`, for these pairs of a defense and an attack instead of all; None where the task judges the release itself.
+
+    Raises
+    ------
+    UserError
+        as `prepare`.
+    """
+    extractor = extractor or Sift()
     name, sources = _dataset(images)
     hashes = {source.name: _content_hash(source) for source in sources}
     public = Public()
@@ -136,28 +156,28 @@ def prepare(
     }
     metrics = tuple(metric() for metric in registry.everything(registry.METRIC))
     settings = {metric.name(): _settings(metric) for metric in metrics}
-    ran = environment.describe([task, extractor, *defenses, *attacks, *metrics])
-    tried: Sequence[Attack | None] = attacks or [None]
+    taking_part = [plugin for pair in pairs for plugin in pair if plugin is not None]
+    ran = environment.describe([task, extractor, *taking_part, *metrics])
+    populations: dict[Defense, Population] = {}
     cells = []
-    for defense in defenses:
-        promise = defense.privacy(public)
+    for defense, attack in pairs:
         protected = spec.configuration(defense, public)
-        drawn = functools.partial(randomness, "population", seed, protected, dataset["extractor"])
-        population = Population(sources, extractor, defense, public, drawn)
-        for attack in tried:
-            reason = task.inapplicable(defense, attack, extractor, public)
-            head = {
-                "schema": records.SCHEMA,
-                "task": task.name(),
-                "defense": protected,
-                "attack": _attack_configuration(task, defense, attack, extractor, public, reason),
-                "dataset": dataset,
-                "metric_settings": settings,
-                "seed": seed,
-            }
-            cell_id = records.cell_id(spec.written(task), head["defense"], head["attack"], dataset, seed, settings)
-            head |= {"cell_id": cell_id, "run_hash": records.run_hash(cell_id, ran), "environment": ran}
-            cells.append(Cell(defense, attack, promise, population, head, reason))
+        if defense not in populations:
+            drawn = functools.partial(randomness, "population", seed, protected, dataset["extractor"])
+            populations[defense] = Population(sources, extractor, defense, public, drawn)
+        reason = task.inapplicable(defense, attack, extractor, public)
+        head = {
+            "schema": records.SCHEMA,
+            "task": task.name(),
+            "defense": protected,
+            "attack": _attack_configuration(task, defense, attack, extractor, public, reason),
+            "dataset": dataset,
+            "metric_settings": settings,
+            "seed": seed,
+        }
+        cell_id = records.cell_id(spec.written(task), head["defense"], head["attack"], dataset, seed, settings)
+        head |= {"cell_id": cell_id, "run_hash": records.run_hash(cell_id, ran), "environment": ran}
+        cells.append(Cell(defense, attack, defense.privacy(public), populations[defense], head, reason))
     if all(cell.reason for cell in cells):
         raise UserError("nothing to run: " + "; ".join(sorted({str(cell.reason) for cell in cells})))
     unique = {cell.head["cell_id"]: cell for cell in cells}  # one that was asked for twice is done once
@@ -206,7 +226,7 @@ def _dataset(images: Images) -> tuple[str, list[Source]]:
         return "builtin", photographs.builtin()
     if isinstance(images, (str, Path)):
         return Path(images).resolve().name, photographs.folder(Path(images))
-    sources = [Source(Path(path).name, Path(path)) for path in images]
+    sources = [image if isinstance(image, Source) else Source(Path(image).name, Path(image)) for image in images]
     if len({source.name for source in sources}) < len(sources):
         raise UserError("two of the photographs have the same file name")
     if not sources:

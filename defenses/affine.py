@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from bench.errors import UnitError, UserError
 from bench.kernels.search import unit_rows
 from bench.kernels.subset import draw_distinct
-from bench.plugin import Asset, Between, Lifting, OneOf, Privacy
+from bench.plugin import Asset, Between, Lifted, Lifting, OneOf, Privacy
 from bench.public import Public
-from bench.types import Bytes, Features, Floats, Subspaces
+from bench.types import Bytes, Features, Floats, Indices, Subspaces
 
 Doubles = NDArray[np.float64]
 
@@ -55,23 +55,24 @@ class Affine(Lifting):
     def adversarial(self) -> int:
         return {"random": 0, "hybrid": self.dim // 2, "adversarial": self.dim}[self.lifting]
 
-    def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> Subspaces:
+    def lifted(self, secret: Features, public: Public, rng: np.random.Generator) -> Lifted:
         length = secret.descriptors.shape[1]
         if self.dim >= length:
             raise UserError(f"affine: dim must be below the descriptors' length, {length}, got {self.dim}")
-        words = self._sub_database(length, public, rng)
+        start, words = self._sub_database(length, public, rng)
         d = secret.descriptors.astype(np.float64)  # (N, D)
-        span = lift(d, words, self.adversarial, self.dim, rng)  # (N, dim, D)
+        span, drawn = lift(d, words, self.adversarial, self.dim, rng)  # (N, dim, D), (N, adversarial)
         origins, bases = reparameterise(d, span, rng)
-        return Subspaces(keypoints=secret.keypoints.copy(), size=secret.size, origins=origins, bases=bases)
+        release = Subspaces(keypoints=secret.keypoints.copy(), size=secret.size, origins=origins, bases=bases)
+        return Lifted(release=release, words=start + drawn)
 
     def privacy(self, public: Public) -> Privacy:
         return Privacy("none")
 
-    def _sub_database(self, length: int, public: Public, rng: np.random.Generator) -> Bytes:
-        """The words that one photograph draws from. -> (S, D)"""
+    def _sub_database(self, length: int, public: Public, rng: np.random.Generator) -> tuple[int, Bytes]:
+        """The words that one photograph draws from, and the row of the database where they begin. -> (S, D)"""
         if self.adversarial == 0:
-            return np.empty((0, length), dtype=np.uint8)
+            return 0, np.empty((0, length), dtype=np.uint8)
         database = public.dictionary(self.database)
         if database.words.shape[1] != length:
             raise UserError(f"affine: the descriptors have length {length}, the database's words {database.words.shape[1]}")
@@ -81,11 +82,12 @@ class Affine(Lifting):
                 f"affine: {self.adversarial} words a keypoint, but {len(database)} words in {self.sub_databases} "
                 f"sub-databases leave {smallest} each"
             )
-        return database.sub_database(int(rng.integers(self.sub_databases)), self.sub_databases)
+        chosen = int(rng.integers(self.sub_databases))
+        return database.start(chosen, self.sub_databases), database.sub_database(chosen, self.sub_databases)
 
 
-def lift(d: Doubles, words: Bytes, adversarial: int, dim: int, rng: np.random.Generator) -> Doubles:
-    """Orthonormal bases of the directions of D. (N, D), (S, D) -> (N, dim, D)
+def lift(d: Doubles, words: Bytes, adversarial: int, dim: int, rng: np.random.Generator) -> tuple[Doubles, Indices]:
+    """Orthonormal bases of the directions of D, and the words it goes through. (N, D), (S, D) -> (N, dim, D), (N, adversarial)
 
     Where a word is the descriptor itself, or the directions are otherwise short of `dim` dimensions, all are drawn again.
 
@@ -96,10 +98,12 @@ def lift(d: Doubles, words: Bytes, adversarial: int, dim: int, rng: np.random.Ge
     """
     rows, length = d.shape
     span = np.empty((rows, length, dim))
+    drawn = np.empty((rows, adversarial), dtype=np.int64)
     waiting = np.arange(rows)
     for _ in range(TRIES):
         directions = np.empty((len(waiting), dim, length))
-        a = unit_rows(words[draw_distinct(len(waiting), len(words), adversarial, rng)])  # (waiting, adversarial, D)
+        drawn[waiting] = draw_distinct(len(waiting), len(words), adversarial, rng)
+        a = unit_rows(words[drawn[waiting]])  # (waiting, adversarial, D)
         directions[:, :adversarial] = a - d[waiting, None]
         directions[:, adversarial:] = rng.uniform(-1, 1, (len(waiting), dim - adversarial, length))
         lengths = np.linalg.norm(directions, axis=2)  # (waiting, dim)
@@ -107,7 +111,7 @@ def lift(d: Doubles, words: Bytes, adversarial: int, dim: int, rng: np.random.Ge
         gained = np.abs(np.diagonal(triangle, axis1=1, axis2=2))  # (waiting, dim) what each adds to those before it
         waiting = waiting[(gained <= DEGENERATE * lengths).any(axis=1)]
         if len(waiting) == 0:
-            return span.transpose(0, 2, 1)
+            return span.transpose(0, 2, 1), drawn
     raise UnitError(f"affine: a descriptor lies in the span of every draw of {adversarial} words of its sub-database")
 
 

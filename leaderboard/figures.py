@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 COLUMNS = 6  # panels in a row, the original included
 SIDE = 2.6  # inches a panel
+LINE = 0.2  # inches a line of a title
 WRAP = 34  # characters of a label's line
 
 
@@ -32,15 +33,16 @@ class Panel:
     beneath: str
 
 
-def draw(panels: Sequence[Panel], heading: str) -> Figure:
-    """Lay panels side by side, at most `COLUMNS` in a row."""
+def draw(panels: Sequence[Panel], heading: str, columns: int = COLUMNS) -> Figure:
+    """Lay panels side by side, at most `columns` in a row."""
     from matplotlib.figure import Figure
 
-    columns = min(COLUMNS, len(panels))
-    rows = -(-len(panels) // columns)
-    figure = Figure(figsize=(columns * SIDE, rows * (SIDE + 0.9) + 0.3), layout="constrained", dpi=120)
+    columns = min(columns, len(panels))
+    rows = [panels[start : start + columns] for start in range(0, len(panels), columns)]
+    height = 0.3 + sum(SIDE + 0.3 + LINE * max(_lines(panel) for panel in row) for row in rows)
+    figure = Figure(figsize=(columns * SIDE, height), layout="constrained", dpi=120)
     figure.suptitle(_drawable(heading), fontsize=9)
-    for axes, panel in zip(figure.subplots(rows, columns, squeeze=False).flat, panels, strict=False):
+    for axes, panel in zip(figure.subplots(len(rows), columns, squeeze=False).flat, panels, strict=False):
         axes.set_title(_wrapped(_drawable(panel.title)), fontsize=8)
         axes.set_xlabel(_drawable(panel.beneath), fontsize=8)
         if panel.pixels is not None:
@@ -67,6 +69,10 @@ def _beneath(record: Record) -> str:
         return "failed: " + textwrap.shorten(record["reason"], 2 * WRAP)
     score = record["metrics"].get("ssim")
     return "no image" if score is None else f"SSIM {score:.3f}"
+
+
+def _lines(panel: Panel) -> int:
+    return _wrapped(panel.title).count("\n") + 1 if panel.title else 0
 
 
 def _wrapped(title: str) -> str:

@@ -68,9 +68,9 @@ def to_markdown(table: Table) -> str:
     lines = [
         f"**{table.heading}**",
         "",
-        _markdown_row(shown.columns),
-        _markdown_row("---" for _ in shown.columns),
-        *(_markdown_row(row) for row in shown.itertuples(index=False)),
+        markdown_row(shown.columns),
+        markdown_row("---" for _ in shown.columns),
+        *(markdown_row(row) for row in shown.itertuples(index=False)),
         "",
         *(f"- {line}" for line in (*explanations(table), *_failures(table))),
     ]
@@ -255,5 +255,5 @@ def _chance(log10: float) -> str:
     return f"{10**log10:.4g}" if log10 > -5 else f"10^{log10:.1f}"
 
 
-def _markdown_row(cells: Iterable[Any]) -> str:
+def markdown_row(cells: Iterable[Any]) -> str:
     return "| " + " | ".join(str(cell).replace("|", "\\|").replace("\n", " ") for cell in cells) + " |"

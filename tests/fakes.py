@@ -1,5 +1,6 @@
 """Plugins and photographs that are made up for tests."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,10 @@ from PIL import Image, ImageFilter
 from scipy.spatial.transform import Rotation
 
 from bench.datasets.scene import File, Reference, Scene, SceneImage
+from bench.features.sift import Sift
+from bench.plugin import Defense, Trial
+from bench.public import Public
+from bench.types import Features, Release
 
 FAKES = {
     "feature_privacy.attacks": {"painter": "fake_plugins.painter:PLUGIN", "guess": "fake_plugins.guess:PLUGIN"},
@@ -60,4 +65,22 @@ def scene(folder: Path, references: int = 3, queries: int = 4) -> Scene:
             SceneImage(**image(f"query/{when}/{i}.png", 75.1), condition=when)
             for i, when in enumerate(["day"] * (queries - queries // 2) + ["night"] * (queries // 2))
         ),
+    )
+
+
+def trial(defense: Defense, secret: Features, *, rng: np.random.Generator | None = None, others: Sequence[Release] = ()) -> Trial:
+    """A trial of a task that judges the release itself, of features without a photograph."""
+    public = Public()
+    return Trial(
+        pixels=np.zeros((*secret.size[::-1], 3), dtype=np.uint8),
+        secret=secret,
+        release=defense.protect(secret, public, np.random.default_rng(1)),
+        defense=defense,
+        attack=None,
+        extractor=Sift(),
+        public=public,
+        metrics=(),
+        rng=rng or np.random.default_rng(2),
+        others=lambda count: iter(others[:count]),
+        repeats=(),
     )

@@ -13,6 +13,7 @@ from bench.features import dictionary
 from bench.kernels.search import unit_rows
 from bench.plugin import Asset, Privacy
 from bench.public import Public
+from bench.testing import same
 from bench.types import Features
 from defenses.affine import PLUGIN as AFFINE
 from defenses.affine import lift, reparameterise
@@ -62,7 +63,9 @@ def test_the_descriptor_and_words_of_one_sub_database_lie_in_d(tmp_path: Path, l
     words = make_words()
     secret = make_features(30)
     defense = AFFINE(lifting=lifting, dim=dim, database=make_database(tmp_path, words))
-    release = defense.protect(secret, Public(), np.random.default_rng(dim))
+    lifted = defense.lifted(secret, Public(), np.random.default_rng(dim))
+    release = lifted.release
+    assert same(release, defense.protect(secret, Public(), np.random.default_rng(dim)))
     assert (release.origins.dtype, release.bases.dtype) == (np.float32, np.float32)
     assert (release.origins.shape, release.bases.shape) == ((30, 128), (30, dim, 128))
     own = np.diagonal(distances(secret.descriptors, release.origins, release.bases))
@@ -72,6 +75,7 @@ def test_the_descriptor_and_words_of_one_sub_database_lie_in_d(tmp_path: Path, l
     # Exactly as many words as were asked for, all of one sub-database, and none that was not.
     inside = distances(unit_rows(words), release.origins, release.bases) < EXACT  # (N, K)
     assert (inside.sum(axis=1) == COUNT[lifting](dim)).all()
+    assert np.array_equal(np.nonzero(inside)[1].reshape(30, -1), np.sort(lifted.words, axis=1))  # those that it tells its owner
     assert len(np.unique(np.nonzero(inside)[1] // 100)) <= 1  # 16 sub-databases of 100 words
     # The control: words that were not drawn, and another's descriptor, are far away.
     others = distances(unit_rows(words), release.origins, release.bases)[~inside]
@@ -106,7 +110,7 @@ Reparameterise = Callable[[np.ndarray, np.ndarray, np.random.Generator], Paramet
 def lifted(count: int = 200, dim: int = 4, adversarial: int = 2) -> Parameters:
     """Descriptors (N, D) and orthonormal directions (N, dim, D)."""
     d = make_features(count).descriptors.astype(float)
-    return d, lift(d, make_words(), adversarial, dim, np.random.default_rng(7))
+    return d, lift(d, make_words(), adversarial, dim, np.random.default_rng(7))[0]
 
 
 def hides_the_descriptor(reparameterise: Reparameterise) -> bool:
@@ -213,7 +217,7 @@ def test_a_word_that_is_the_descriptor_is_never_drawn() -> None:
     assert secret.codes is not None
     words = np.concatenate([np.repeat(secret.codes, 10, axis=0), make_words(10)])
     d = np.repeat(secret.descriptors, 100, axis=0).astype(float)
-    span = lift(d, words, 2, 4, np.random.default_rng(0))
+    span, _ = lift(d, words, 2, 4, np.random.default_rng(0))
     inside = distances(unit_rows(words[10:]), d, span) < EXACT
     assert (inside.sum(axis=1) == 2).all()
     np.testing.assert_allclose(np.einsum("nid,njd->nij", span, span), np.tile(np.eye(4), (100, 1, 1)), atol=1e-9)

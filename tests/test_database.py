@@ -33,7 +33,7 @@ class Case:
 def lifted(d: np.ndarray, words: np.ndarray, dim: int, seed: int = 0) -> Case:
     """Hybrid lifting through words of the whole of `words`."""
     adversarial = dim // 2
-    span = lift(d.astype(float), words, adversarial, dim, np.random.default_rng(seed))
+    span, _ = lift(d.astype(float), words, adversarial, dim, np.random.default_rng(seed))
     release = released(d, span, seed)
     found, distances = nearest_to_subspaces(release, words, adversarial)
     assert distances.max() < 1e-6
@@ -124,7 +124,7 @@ def test_a_word_near_d_is_preferred_to_nearer_ones_near_an_adversary(rng):
 
 def test_it_depends_on_the_subspace_and_not_on_its_basis(rng):
     d, words = families(rng, 60)
-    span = lift(d.astype(float), words, 3, 6, rng)
+    span, _ = lift(d.astype(float), words, 3, 6, rng)
     one, other = (Case(d, d[:, None], released(d, span, seed), Affine(dim=6)) for seed in (1, 2))
     assert np.abs(one.release.origins - other.release.origins).max() > 0.1
     attack = Database(neighbours=30, estimators=4)

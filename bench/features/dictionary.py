@@ -50,8 +50,11 @@ class Dictionary:
 
     def sub_database(self, index: int, count: int) -> Bytes:
         """The rows of sub-database `index` of `count`, by the rule at the top of this file."""
-        size = len(self.words)
-        return self.words[index * size // count : (index + 1) * size // count]
+        return self.words[self.start(index, count) : self.start(index + 1, count)]
+
+    def start(self, index: int, count: int) -> int:
+        """The first row of sub-database `index` of `count`."""
+        return index * len(self.words) // count
 
 
 def save(path: Path, words: Bytes, meta: dict[str, Any]) -> Dictionary:

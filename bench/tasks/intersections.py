@@ -1,0 +1,106 @@
+"""Intersections: whether the words near a subspace lie around the points that it was made of (the paper's Table S3).
+
+The paper: "for each subspace, we select the top N database descriptors closest to the subspace, and match them to the m/2 + 1
+descriptors forming the subspace. Using the standard ratio test we report the percentage of successful matches."
+
+As read here: the N words of the database that are nearest to the subspace, the m/2 adversarial ones left out, are matched to d
+and the a_i; a match succeeds if the nearest of those m/2 + 1 points is less than 0.8 times as far as the second nearest.
+With the adversarial words among the N, success at N = 5 and m = 16 is 100% by construction (five of the eight words that lie in
+the subspace match themselves), and the paper prints 94.38%; that share is measured as `with_adversarial_top5` and so on.
+Matching the other way, each of the m/2 + 1 points to its nearest among the N words, succeeds more often as m grows, as all a_i
+are words and match themselves; the paper's falls.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench import fields
+from bench.errors import UnitError, UserError
+from bench.kernels.search import unit_rows
+from bench.kernels.subspaces import nearest_to_subspaces
+from bench.plugin import Attack, Defense, Extractor, Lifting, Outcome, Task, Trial
+from bench.public import Public
+from bench.types import Features, Floats
+
+COUNTS = (50, 20, 10, 5)  # N
+BATCH = 64  # subspaces at a time
+
+
+@dataclass(frozen=True, kw_only=True)
+class Intersections(Task):
+    """How often the words nearest to a subspace match one of the points that it goes through. Made by the owner, who knows them.
+
+    The descriptors of a photograph are lifted again and again until there are `subspaces` liftings, or each once for 0.
+    """
+
+    attacked = False
+
+    ratio: float = 0.8  # of the distances to the nearest and the second nearest; a match is below it
+    subspaces: int = 0  # lifted of each photograph
+
+    def __post_init__(self) -> None:
+        if not 0 < self.ratio <= 1:
+            raise UserError(f"intersections: ratio must be above 0 and at most 1, got {self.ratio}")
+        if self.subspaces < 0:
+            raise UserError(f"intersections: subspaces must be at least 0, got {self.subspaces}")
+
+    def inapplicable(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> str | None:
+        if not isinstance(defense, Lifting) or "database" not in fields.asset_fields(defense):
+            return f"{defense.name()} does not lift descriptors to subspaces through words of a database"
+        return None if defense.adversarial else f"{defense.name()} as configured leads its subspaces through no word"
+
+    def resolved(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> Mapping[str, Any]:
+        return {}
+
+    def judge(self, trial: Trial) -> Outcome:
+        defense = trial.defense
+        if not isinstance(defense, Lifting):
+            raise UnitError("intersections needs subspaces through words of a database")
+        words = unit_rows(trial.public.dictionary(fields.asset_fields(defense)["database"]).words)  # (K, D)
+        count = self.subspaces or len(trial.secret)
+        alone, among = [], []
+        for secret in rounds(trial.secret, count, trial.rng):
+            lifted = defense.lifted(secret, trial.public, trial.rng)
+            near, _ = nearest_to_subspaces(lifted.release, words, max(COUNTS) + defense.adversarial)  # (n, N + a)
+            for rows in np.array_split(np.arange(len(near)), -(-len(near) // BATCH)):
+                points = np.concatenate([secret.descriptors[rows, None], words[lifted.words[rows]]], axis=1)  # (b, 1 + a, D)
+                match = matches(words[near[rows]], points, self.ratio)  # (b, N + a)
+                among.append(match)
+                alone.append(without(match, (near[rows][:, :, None] == lifted.words[rows][:, None]).any(axis=2), max(COUNTS)))
+        return Outcome(metrics={**_shares("success", alone), **_shares("with_adversarial", among), "subspaces": float(count)})
+
+
+def rounds(secret: Features, count: int, rng: np.random.Generator) -> Iterator[Features]:
+    """The descriptors in random order, again and again, until there are `count` of them."""
+    while count > 0:
+        chosen = np.sort(rng.permutation(len(secret))[:count])
+        yield secret.take(chosen)
+        count -= len(chosen)
+
+
+def matches(words: Floats, points: Floats, ratio: float) -> NDArray[np.bool_]:
+    """Whether a word's nearest point is less than `ratio` times as far as its second nearest. (n, N, D), (n, p, D) -> (n, N)"""
+    away = np.linalg.norm(words[:, :, None].astype(np.float64) - points[:, None], axis=3)  # (n, N, p)
+    nearest, second = np.moveaxis(np.partition(away, 1, axis=2)[:, :, :2], 2, 0)
+    return nearest < ratio * second
+
+
+def without(match: NDArray[np.bool_], left_out: NDArray[np.bool_], count: int) -> NDArray[np.bool_]:
+    """Of each row the first `count` that are not left out. (n, N + a), (n, N + a) -> (n, count)"""
+    order = np.argsort(left_out, axis=1, kind="stable")[:, :count]
+    return np.take_along_axis(match, order, axis=1)
+
+
+def _shares(name: str, match: list[NDArray[np.bool_]]) -> dict[str, float]:
+    """The share of successes among the first N columns, for each N."""
+    rows = np.concatenate(match)
+    return {f"{name}_top{count}": float(rows[:, :count].mean()) for count in COUNTS}
+
+
+PLUGIN = Intersections

@@ -1,0 +1,64 @@
+"""How large a reproduction is: the sizes of each profile, and the files that it works with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from bench.errors import unknown
+from bench.plugin import Asset, Extractor
+
+
+@dataclass(frozen=True, kw_only=True)
+class Profile:
+    """Sizes. The code is the same for all profiles."""
+
+    name: str
+    photographs: int  # of a table, at most
+    builtin: tuple[str, ...] | None  # the built-in photographs to use; all for None
+    pictures: int  # photographs of a figure, at most
+    scale: float  # of every |K| of a table that varies it; every ε is shifted by its logarithm
+    subspaces: int  # that Table S3 lifts, in all
+    others: int  # releases of other photographs that Table S4 looks at, times the dimension
+
+
+# The two built-in photographs with the fewest keypoints.
+SMOKE = Profile(name="smoke", photographs=2, builtin=("rocket", "flower"), pictures=2, scale=0.5, subspaces=40, others=64)
+CPU = Profile(name="cpu", photographs=20, builtin=None, pictures=3, scale=0.5, subspaces=20_000, others=2560)
+PAPER = Profile(name="paper", photographs=1_000_000, builtin=None, pictures=10, scale=1.0, subspaces=100_000, others=5120)
+PROFILES = {profile.name: profile for profile in (SMOKE, CPU, PAPER)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Materials:
+    """Dictionaries, databases and networks: those of this distribution, or a user's own."""
+
+    dictionary: Asset = Asset("shipped")  # K of LDP-Feat; a smaller |K| is its first words
+    database: Asset = Asset("shipped")  # W of affine lifting
+    public_database: Asset = Asset("shipped-public")  # Z
+    raw_network: Asset = Asset("shipped")
+    affine_network: Asset = Asset("shipped")
+    ldp_network: Asset = Asset("shipped")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Setting:
+    """All that the rows of a table depend on."""
+
+    profile: Profile
+    materials: Materials
+    extractor: Extractor
+    photographs: int  # that there are
+    seed: int = 0
+
+
+def profile(name: str) -> Profile:
+    """The profile of that name.
+
+    Raises
+    ------
+    UserError
+        if there is none.
+    """
+    if name not in PROFILES:
+        raise unknown("profile", name, PROFILES)
+    return PROFILES[name]

@@ -1,0 +1,20 @@
+"""What the paper prints (Pittaluga and Zhuang, ICCV 2023, with its supplement): its tables as CSV files."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+FOLDER = Path(__file__).parent / "paper"
+
+
+def lines(name: str) -> list[dict[str, str]]:
+    """The rows of the table in the file `name`.csv, as text by column."""
+    with (FOLDER / f"{name}.csv").open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def numbers(line: Mapping[str, str], columns: Iterable[str]) -> dict[str, float]:
+    """Those columns of a row as numbers."""
+    return {column: float(line[column]) for column in columns}

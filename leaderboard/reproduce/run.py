@@ -1,0 +1,181 @@
+"""Runs the rows of a table through the runner, and weighs its claims by what came out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import pandas as pd
+
+from bench import runner
+from bench.datasets import photographs
+from bench.datasets.photographs import Source
+from bench.plugin import Task
+from bench.progress import Progress
+from bench.records import Record
+from bench.runner import Plan
+from leaderboard.reproduce import study
+from leaderboard.reproduce.claims import Cell, Finding, judge
+from leaderboard.reproduce.intervals import Interval, interval, rank_correlation
+from leaderboard.reproduce.profiles import Profile, Setting
+from leaderboard.reproduce.study import Row, Table
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Photographs:
+    """What a reproduction is made of."""
+
+    name: str
+    chosen: tuple[Source, ...]
+    available: int
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Ran:
+    """Rows, and what the runner recorded of them."""
+
+    rows: tuple[Row, ...]
+    cells: Mapping[str, str]  # row's name -> the cell_id of its records
+    records: Mapping[str, tuple[Record, ...]]  # cell_id -> its records
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Rebuilt:
+    """A table beside the paper's."""
+
+    table: Table
+    setting: Setting
+    photographs: Photographs
+    ran: Ran
+    ours: Mapping[Cell, Interval]  # those that there are
+    notes: Mapping[str, str]  # row's name -> why it has no values, or what a reader should know of them
+    correlation: float | None  # Spearman's, over the table's own rows
+    findings: tuple[Finding, ...]
+
+
+def choose(images: Path | None, profile: Profile, most: int) -> Photographs:
+    """The photographs of a folder by name, or the built-in ones that the profile takes, at most so many.
+
+    Raises
+    ------
+    UserError
+        if the folder does not exist or holds no photograph.
+    """
+    if images is None:
+        sources = [source for source in photographs.builtin() if profile.builtin is None or source.name in profile.builtin]
+        return Photographs(name="built-in photographs", chosen=tuple(sources[:most]), available=len(sources))
+    sources = photographs.folder(images)
+    name = f"photographs of {images.resolve().name}"
+    return Photographs(name=name, chosen=tuple(sources[:most]), available=len(sources))
+
+
+def rebuild(table: Table, setting: Setting, chosen: Photographs, out: Path) -> Rebuilt:
+    """Run what `out` does not hold yet, and weigh the claims.
+
+    Raises
+    ------
+    UserError
+        if a file is missing or does not fit; nothing has been written then.
+    """
+    rows = (*table.rows(setting), *table.borrowed(setting))
+    return weigh(table, setting, chosen, execute(rows, setting, chosen.chosen, out, table.name))
+
+
+def execute(rows: Sequence[Row], setting: Setting, sources: Sequence[Source], out: Path, title: str) -> Ran:
+    """Run the rows on the photographs, one plan for each task; records that `out` holds are not made again."""
+    plans = [_plan(task, rows, setting, sources) for task in dict.fromkeys(row.task for row in rows)]
+    cells = {row.name: _cell(row, plans) for row in rows}
+    records: dict[str, list[Record]] = {}
+    with Progress(f"{title}: {len(sources)} photographs, {len(rows)} rows", sum(map(len, plans))) as progress:
+        while plans:  # a plan that is done lets go of the releases that it made
+            for record in runner.execute(plans.pop(0), out):
+                records.setdefault(record["cell_id"], []).append(record)
+                progress.advance(note=record["unit"])
+                if record["status"] == "failed":
+                    progress.say(f"bench: failed: {record['unit']}, {record['defense']['name']}: {record['reason']}")
+    return Ran(rows=tuple(rows), cells=cells, records={cell: tuple(found) for cell, found in records.items()})
+
+
+def weigh(table: Table, setting: Setting, chosen: Photographs, ran: Ran) -> Rebuilt:
+    """Means, intervals, rank correlation and verdicts from records alone."""
+    reasons = {row.name: reason for row in ran.rows if (reason := _reason(of(ran, row.name)))}
+    columns = _columns(table, ran)
+    paper = study.printed(ran.rows)
+    ours = {cell: interval(column) for cell, column in columns.items() if len(column)}
+    return Rebuilt(
+        table=table,
+        setting=setting,
+        photographs=chosen,
+        ran=ran,
+        ours=ours,
+        notes={row.name: reasons.get(row.name) or _notes(of(ran, row.name)) for row in ran.rows},
+        correlation=_correlation(table, table.rows(setting), ours),
+        findings=judge(table.claims(paper), pd.DataFrame(columns), paper, reasons),
+    )
+
+
+def of(ran: Ran, row: str) -> tuple[Record, ...]:
+    """The records of a row."""
+    return ran.records.get(ran.cells[row], ())
+
+
+def failures(ran: Ran) -> int:
+    """Records of photographs that could not be done."""
+    return sum(record["status"] == "failed" for records in ran.records.values() for record in records)
+
+
+def _plan(task: Task, rows: Sequence[Row], setting: Setting, sources: Sequence[Source]) -> Plan:
+    pairs = [(row.defense, row.attack) for row in rows if row.task == task]
+    defenses = list(dict.fromkeys(defense for defense, _ in pairs))
+    pairs.sort(key=lambda pair: defenses.index(pair[0]))  # so that each photograph is protected once by each
+    return runner.prepare_pairs(pairs, sources, task=task, extractor=setting.extractor, seed=setting.seed)
+
+
+def _cell(row: Row, plans: Sequence[Plan]) -> str:
+    found = [
+        cell.head["cell_id"]
+        for plan in plans
+        for cell in plan.cells
+        if (plan.task, cell.defense, cell.attack) == (row.task, row.defense, row.attack)
+    ]
+    return str(found[0])
+
+
+def _columns(table: Table, ran: Ran) -> dict[Cell, pd.Series]:
+    """The values of each cell by photograph, in the paper's unit."""
+    return {
+        (row.name, measure): pd.Series(
+            {
+                record["unit"]: record["metrics"][wanted.metric] * wanted.times
+                for record in of(ran, row.name)
+                if record["status"] == "ok" and record["metrics"].get(wanted.metric) is not None
+            },
+            dtype=float,
+        )
+        for row in ran.rows
+        for measure, wanted in table.measures.items()
+    }
+
+
+def _correlation(table: Table, rows: Iterable[Row], ours: Mapping[Cell, Interval]) -> float | None:
+    if table.ordered is None:
+        return None
+    both = [(row.paper[table.ordered], ours[row.name, table.ordered].mean) for row in rows if (row.name, table.ordered) in ours]
+    return rank_correlation(*zip(*both, strict=True)) if len(both) > 1 else None
+
+
+def _reason(records: Sequence[Record]) -> str | None:
+    """Why a row has no values; None if it has some."""
+    if any(record["status"] == "ok" for record in records):
+        return None
+    told = dict.fromkeys(str(record["reason"]) for record in records)
+    return "n/a: " + "; ".join(told) if told else "n/a"
+
+
+def _notes(records: Sequence[Record]) -> str:
+    """What all photographs of a row share, and how many failed."""
+    done = [record for record in records if record["status"] == "ok"]
+    shared = [note for note in done[0]["notes"] if all(note in record["notes"] for record in done)]
+    failed = len(records) - len(done)
+    return "; ".join([*([f"{failed} failed"] if failed else []), *shared])

@@ -1,0 +1,233 @@
+"""`bench reproduce` from end to end in its smallest form: files, verdicts from records, and going on after an interruption."""
+
+import csv
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from fakes import album
+from PIL import Image
+
+from bench import cli, progress, registry
+from bench.features.sift import Sift
+from bench.plugin import Attack, Defense
+from bench.records import FILE, Record
+from bench.tasks.reconstruction import Reconstruction
+from leaderboard.reproduce import figures, report, run, tables
+from leaderboard.reproduce.claims import Claim, Verdict, falling, same_order
+from leaderboard.reproduce.profiles import CPU, SMOKE, Materials, Setting
+from leaderboard.reproduce.run import Photographs, Ran
+from leaderboard.reproduce.study import Measure, Row, Table, build
+
+TABLES = sorted(tables.everything())
+
+
+@pytest.fixture(scope="module")
+def images(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two pictures of some 60 keypoints."""
+    return album(tmp_path_factory.mktemp("reproduce") / "album")
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder that tables share."""
+    return tmp_path_factory.mktemp("reproduce") / "out"
+
+
+def reproduce(name: str, images: Path, out: Path, *more: str) -> int:
+    return cli.main(["reproduce", name, "--profile", "smoke", "--images", str(images), "--out", str(out), *more])
+
+
+def lines(out: Path) -> list[bytes]:
+    return (out / FILE).read_bytes().splitlines()
+
+
+# ---- from end to end
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_smoke(name: str, images: Path, out: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert reproduce(name, images, out) == 0
+    printed = capsys.readouterr().out
+    found = json.loads((out / f"{name}.json").read_text())
+    measured = [row for row in found["rows"] if any(value["ours"] is not None for value in row["ours"].values())]
+    assert measured
+    assert all(row["note"].startswith("n/a") for row in found["rows"] if row not in measured)
+    written = (out / f"{name}.md").read_text()
+    for claim in found["claims"]:
+        assert claim["claim"] in written
+        assert claim["verdict"] == "cannot tell"  # of two photographs nothing can be told
+        assert claim["statements"]
+    assert found["title"] in printed
+    cells = list(csv.DictReader((out / f"{name}.csv").open(encoding="utf-8")))
+    assert len(cells) == len(found["rows"]) * len(tables.everything()[name].measures)
+    statements = list(csv.DictReader((out / f"{name}-claims.csv").open(encoding="utf-8")))
+    assert len(statements) == sum(len(claim["statements"]) for claim in found["claims"])
+
+
+def test_done_again_nothing_runs_and_all_stays(images: Path, out: Path) -> None:
+    """And Table 4 takes what it compares with from Table 1's records."""
+    for name in ("table1", "table4"):
+        if not (out / f"{name}.json").is_file():  # as it is after `test_smoke`
+            assert reproduce(name, images, out) == 0
+    before, text = lines(out), (out / "table4.json").read_bytes()
+    assert reproduce("table4", images, out) == 0
+    assert lines(out) == before
+    assert (out / "table4.json").read_bytes() == text
+    borrowed = {row["cell_id"] for row in json.loads(text)["rows"]} & {
+        row["cell_id"] for row in json.loads((out / "table1.json").read_text())["rows"]
+    }
+    assert len(borrowed) == 12
+
+
+def test_figures(images: Path, out: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert reproduce("figures", images, out) == 0
+    printed = capsys.readouterr().out
+    for drawing in figures.everything():
+        if drawing.left_out() is not None:
+            assert f"left out: {drawing.name}" in printed
+            continue
+        files = sorted((out / "figures").rglob(f"{drawing.name}*"))
+        assert {file.suffix for file in files} == {".png", ".pdf"}
+        for file in files:
+            assert str(file) in printed
+            if file.suffix == ".png":
+                assert np.asarray(Image.open(file).convert("L")).std() > 5  # something is drawn
+
+
+def test_interrupted_reproduction_goes_on_and_ends_as_if_it_had_not_been(
+    images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    assert reproduce("tableS3", images, whole) == 0
+    with monkeypatch.context() as interrupted:
+        advance: Callable[..., None] = progress.Progress.advance
+
+        def once(self: progress.Progress, *args: Any, **more: Any) -> None:
+            advance(self, *args, **more)
+            raise KeyboardInterrupt
+
+        interrupted.setattr(progress.Progress, "advance", once)
+        assert reproduce("tableS3", images, broken) == 130
+    assert len(lines(broken)) == 1
+    assert not (broken / "tableS3.json").exists()
+    assert reproduce("tableS3", images, broken) == 0
+    assert len(lines(broken)) == len(lines(whole)) == 4
+    for name in ("tableS3.json", "tableS3.md", "tableS3.csv", "tableS3-claims.csv"):
+        assert (broken / name).read_bytes() == (whole / name).read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (("table7",), "unknown table 'table7'; did you mean"),
+        (("table1", "--profile", "big"), "unknown profile 'big'; there is cpu, paper, smoke"),
+        (("table4", "--profile", "paper"), "has 256,000 words, and profile paper needs 512,000"),
+        (("tableS3", "--images", "nowhere"), "no such folder"),
+        (("tableS3", "--database", "nowhere.safetensors"), "nowhere.safetensors"),
+        (("tableS3", "--size", "3"), "unknown option '--size'"),
+        ((), "--what is missing"),
+    ],
+)
+def test_mistakes(words: tuple[str, ...], complaint: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["reproduce", *words, *(("--out", str(tmp_path / "out")) if words else ())]) == 2
+    assert complaint in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+# ---- from records to verdicts, on made-up records
+
+PAPER = {"raw": 0.7, "two": 0.5, "four": 0.4, "none": 0.1}
+
+
+def made_up_rows(setting: Setting) -> tuple[Row, ...]:
+    defense: Defense = build(registry.DEFENSE, "none", {})
+    attack: Attack = build(registry.ATTACK, "dia", {})
+    return tuple(
+        Row(name=name, labels={"row": name}, paper={"ssim": ssim}, defense=defense, attack=attack, task=Reconstruction())
+        for name, ssim in PAPER.items()
+    )
+
+
+TABLE = Table(
+    name="made-up",
+    title="A table",
+    measures={"ssim": Measure(metric="ssim", times=2.0), "other": Measure(metric="other")},
+    rows=made_up_rows,
+    claims=lambda paper: (
+        same_order(paper, 0.03, "SSIM"),
+        Claim(text="It falls.", statements=falling([("two", "ssim"), ("four", "ssim")])),
+    ),
+    ordered="ssim",
+)
+
+
+def made_up(ssim: dict[str, list[float | None]]) -> run.Rebuilt:
+    """A table from records that hold half the given values; None for a photograph that failed, and no values for n/a."""
+    setting = Setting(profile=CPU, materials=Materials(), extractor=Sift(), photographs=8)
+    records: dict[str, tuple[Record, ...]] = {
+        name: tuple(
+            {"unit": str(unit), "status": "failed", "reason": "broken", "metrics": {}, "notes": []}
+            if value is None
+            else {"unit": str(unit), "status": "ok", "reason": None, "metrics": {"ssim": value / 2}, "notes": ["small"]}
+            for unit, value in enumerate(values)
+        )
+        or ({"unit": "*", "status": "n/a", "reason": "no network", "metrics": {}, "notes": []},)
+        for name, values in ssim.items()
+    }
+    ran = Ran(rows=made_up_rows(setting), cells={name: name for name in ssim}, records=records)
+    return run.weigh(TABLE, setting, Photographs(name="photographs", chosen=(), available=8), ran)
+
+
+def around(mean: float, count: int = 8) -> list[float | None]:
+    return [mean + 0.01 * (number % 2) for number in range(count)]
+
+
+def test_means_verdicts_and_correlation_from_records() -> None:
+    rebuilt = made_up({"raw": around(0.6), "two": around(0.3), "four": around(0.4), "none": []})
+    ours = rebuilt.ours["raw", "ssim"]
+    assert (ours.mean, ours.count) == (pytest.approx(0.605), 8)
+    assert ("none", "ssim") not in rebuilt.ours
+    assert ("raw", "other") not in rebuilt.ours
+    assert rebuilt.correlation == pytest.approx(0.5)  # raw, two, four against raw, four, two
+    order, falls = rebuilt.findings
+    assert falls.verdict is Verdict.FAILS
+    assert order.verdict is Verdict.FAILS
+    verdicts = [evidence.verdict for evidence in order.evidence]
+    assert (verdicts.count(Verdict.HOLDS), verdicts.count(Verdict.FAILS), verdicts.count(Verdict.OPEN)) == (2, 1, 3)
+
+
+def test_what_fails_or_does_not_apply_is_said_in_every_form() -> None:
+    rebuilt = made_up({"raw": [None, *around(0.6, 7)], "two": around(0.3), "four": around(0.4), "none": []})
+    assert rebuilt.notes == {"raw": "1 failed; small", "two": "small", "four": "small", "none": "n/a: no network"}
+    assert run.failures(rebuilt.ran) == 1
+    written = report.markdown(rebuilt)
+    assert "does not hold: [two] ssim > [four] ssim: paper 0.1, ours -0.1 [-0.1, -0.1]" in written
+    assert "cannot tell: [raw] ssim > [none] ssim: paper 0.6, nothing measured (none: n/a: no network)" in written
+    assert "(Of 6: 2 hold, 1 do not hold, 3 cannot be told.)" in written
+    shown = report.side_by_side(rebuilt)
+    assert list(shown["n"]) == ["7", "8", "8", "0"]
+    assert shown["ssim, ours"].iloc[3] == "n/a"
+    assert "0.605" in shown["ssim, ours"].iloc[1] or "0.305" in shown["ssim, ours"].iloc[1]
+    plain = report.plain(rebuilt)
+    assert json.loads(json.dumps(plain, allow_nan=False)) == plain
+    assert [claim["verdict"] for claim in plain["claims"]] == ["does not hold", "does not hold"]
+    numbers = report.numbers(rebuilt).set_index(["row", "measure"])
+    assert pd.isna(numbers.loc[("none", "ssim"), "ours"])
+    assert numbers.loc[("two", "ssim"), "photographs"] == 8
+
+
+def test_the_order_of_the_paper_is_confirmed_where_it_is_there() -> None:
+    rebuilt = made_up({name: around(value) for name, value in PAPER.items()})
+    assert [finding.verdict for finding in rebuilt.findings] == [Verdict.HOLDS, Verdict.HOLDS]
+    assert rebuilt.correlation == pytest.approx(1)
+
+
+def test_smoke_is_small() -> None:
+    assert SMOKE.photographs <= 2
+    assert SMOKE.builtin is not None
+    assert len(SMOKE.builtin) <= 2
