@@ -7,15 +7,16 @@ All pairs are screened in float32 after a projection onto dim + dim' + 16 fixed 
 that meet still do, and strangers stay apart in the 16 directions to spare. Those that remain are decided again in float64 and in
 all dimensions: there the float32 releases of one descriptor meet to about 1e-7, and strangers keep a tenth and more.
 
-Floor, for a pair of equal dimensions: 2 (dim + 1)² (2 dim + 16) operations of a matrix product, then dim (dim + 1)² + (dim + 1)³ / 3
-multiply-adds of the elimination. These take most of the time; pairs lie side by side in memory, so that each step is a long loop.
+Floor, for a pair of equal dimensions: 2 (dim + 1)² (2 dim + 16) operations of a matrix product, dim (dim + 1)² + (dim + 1)³ / 3
+multiply-adds of the elimination. The latter take most of the time; pairs lie side by side in memory, so each step is a long loop.
 """
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,7 +24,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bench.device import pick_device
-from bench.types import Floats, Indices, Subspaces
+from bench.errors import UserError
+from bench.types import Indices, Subspaces
 
 Doubles = NDArray[np.float64]
 
@@ -49,11 +51,18 @@ class Meetings:
     def __len__(self) -> int:
         return len(self.first)
 
+    def take(self, rows: NDArray[Any]) -> Meetings:
+        """Some of the pairs, in the order of `rows`: indices, or a mask."""
+        return Meetings(self.first[rows], self.second[rows], self.points[rows], self.single[rows])
+
 
 def meetings(one: Subspaces, other: Subspaces) -> Meetings:
     """All pairs of a subspace of `one` and one of `other` that meet.
 
-    Where their dimensions add up to D or more, all pairs do.
+    Raises
+    ------
+    UserError
+        if their dimensions add up to D or more, where all pairs meet.
     """
     return _decided(one, other, _screened(one, other))
 
@@ -64,27 +73,21 @@ def meetings_within(release: Subspaces) -> Meetings:
     return _decided(release, release, ((first[first < second], second[first < second]) for first, second in pairs))
 
 
-def meeting_points(one: Subspaces, other: Subspaces) -> Doubles:
-    """The point nearest to both subspaces of each keypoint, for two releases of the same keypoints. -> (N, D)
-
-    Two liftings of one descriptor meet there, and in no other point unless they share an adversarial descriptor, too.
-    """
-    rows = np.arange(len(one))
-    return _decided(one, other, iter([(rows, rows)]), within=np.inf).points
-
-
-def stacked(releases: Sequence[Subspaces]) -> Subspaces:
-    """The subspaces of at least one release, one after the other."""
-    return replace(
-        releases[0],
-        keypoints=np.concatenate([release.keypoints for release in releases]),
-        origins=np.concatenate([release.origins for release in releases]),
-        bases=np.concatenate([release.bases for release in releases]),
+def joined(parts: Sequence[Meetings]) -> Meetings:
+    """The pairs of at least one list, one after the other."""
+    return Meetings(
+        np.concatenate([part.first for part in parts]),
+        np.concatenate([part.second for part in parts]),
+        np.concatenate([part.points for part in parts]),
+        np.concatenate([part.single for part in parts]),
     )
 
 
 def _screened(one: Subspaces, other: Subspaces, triangle: bool = False) -> Iterator[tuple[Indices, Indices]]:
     """Pairs that may meet, block by block; `triangle` leaves out blocks of which each pair has `first` > `second`."""
+    length = one.origins.shape[1]
+    if one.dim + other.dim >= length:
+        raise UserError(f"subspaces of dimensions {one.dim} and {other.dim} always meet in a space of {length}")
     device = pick_device()
     mine, theirs = (_projected(release, one.dim + other.dim + SPARE).to(device) for release in (one, other))  # (dim + 1, N, k)
     columns = max(1, BLOCK // ((other.dim + 1) ** 2 * ROWS))
@@ -111,7 +114,7 @@ def _directions(length: int, count: int) -> Doubles:
 
 
 def _squared_distances(mine: Tensor, theirs: Tensor) -> Tensor:
-    """dist² of all pairs of subspaces, each given by a basis and its point nearest to zero. (a + 1, n, k), (b + 1, n', k) -> (n, n')
+    """dist² of all pairs. (a + 1, n, k), (b + 1, n', k) bases and, last, the points nearest to zero -> (n, n')
 
     Symmetric elimination. What lies above the diagonal of the form is never read.
     """
@@ -131,44 +134,37 @@ def _squared_distances(mine: Tensor, theirs: Tensor) -> Tensor:
     return form[other, other]
 
 
-def _decided(one: Subspaces, other: Subspaces, pairs: Iterator[tuple[Indices, Indices]], within: float = MEETS) -> Meetings:
-    """Of these pairs those whose distance is below `within`, in float64."""
-    firsts, seconds = (np.concatenate([np.empty(0, np.int64), *rows]) for rows in zip(*pairs, strict=True))
-    found = []
+def _decided(one: Subspaces, other: Subspaces, screened: Iterator[tuple[Indices, Indices]]) -> Meetings:
+    """Those of the screened pairs that meet, in float64."""
+    pairs = [np.empty((2, 0), dtype=np.int64), *(np.stack(pair) for pair in screened)]
+    firsts, seconds = np.concatenate(pairs, axis=1)
+    found = [Meetings(firsts[:0], seconds[:0], np.empty((0, one.origins.shape[1])), np.empty(0, dtype=bool))]
     for start in range(0, len(firsts), EXACT):
         first, second = firsts[start : start + EXACT], seconds[start : start + EXACT]
-        points, distances, single = _nearest_points(
-            (one.origins[first], one.bases[first]), (other.origins[second], other.bases[second])
-        )
-        met = distances < within
-        found.append(Meetings(first[met], second[met], points[met], single[met]))
-    if not found:
-        return Meetings(firsts, seconds, np.empty((0, one.origins.shape[1])), np.empty(0, bool))
-    return Meetings(
-        np.concatenate([part.first for part in found]),
-        np.concatenate([part.second for part in found]),
-        np.concatenate([part.points for part in found]),
-        np.concatenate([part.single for part in found]),
-    )
+        points, distances, single = nearest_points(one.take(first), other.take(second))
+        found.append(Meetings(first, second, points, single).take(distances < MEETS))
+    return joined(found)
 
 
-def _nearest_points(one: tuple[Floats, Floats], other: tuple[Floats, Floats]) -> tuple[Doubles, Doubles, NDArray[np.bool_]]:
-    """Midpoints of the nearest points of P pairs of subspaces, their distances, and whether they are the only nearest ones.
+def nearest_points(one: Subspaces, other: Subspaces) -> tuple[Doubles, Doubles, NDArray[np.bool_]]:
+    """Where the subspaces of each row come nearest to each other, in float64.
 
-    Of several nearest points, one whose coordinates in the other subspace are small. (P, D), (P, dim, D) twice -> (P, D), (P,), (P,)
+    Returns
+    -------
+    (N, D) midpoints of the nearest points of the two, (N,) their distances, and (N,) whether they are the only nearest ones.
     """
-    (p, A), (q, B) = ((origins.astype(np.float64), _orthonormal(bases.astype(np.float64))) for origins, bases in (one, other))
-    apart = (q - p)[..., None]  # (P, D, 1)
-    G = A @ B.transpose(0, 2, 1)  # (P, dim, dim')
-    slope = B @ apart - G.transpose(0, 2, 1) @ (A @ apart)  # (P, dim', 1)
-    values, vectors = np.linalg.eigh(np.eye(B.shape[1]) - G.transpose(0, 2, 1) @ G)  # (P, dim'), (P, dim', dim')
+    (p, A), (q, B) = ((part.origins.astype(np.float64), _orthonormal(part.bases.astype(np.float64))) for part in (one, other))
+    apart = (q - p)[..., None]  # (N, D, 1)
+    G = A @ B.transpose(0, 2, 1)  # (N, dim, dim')
+    slope = B @ apart - G.transpose(0, 2, 1) @ (A @ apart)  # (N, dim', 1)
+    values, vectors = np.linalg.eigh(np.eye(B.shape[1]) - G.transpose(0, 2, 1) @ G)  # (N, dim'), (N, dim', dim')
     inverse = np.where(values > SINGULAR, 1 / np.where(values > SINGULAR, values, 1), 0)[..., None]
-    theirs = -vectors @ (inverse * (vectors.transpose(0, 2, 1) @ slope))  # (P, dim', 1)
-    away = apart + B.transpose(0, 2, 1) @ theirs  # (P, D, 1) from p to the nearest point of the other
+    theirs = -vectors @ (inverse * (vectors.transpose(0, 2, 1) @ slope))  # (N, dim', 1) coordinates of the other's nearest point
+    away = apart + B.transpose(0, 2, 1) @ theirs  # (N, D, 1) from p to it
     mine = A.transpose(0, 2, 1) @ (A @ away)
     return p + ((away + mine) / 2)[..., 0], np.linalg.norm((away - mine)[..., 0], axis=1), values[:, 0] > SINGULAR
 
 
 def _orthonormal(bases: Doubles) -> Doubles:
-    """Bases that are orthonormal to 1e-7 as float32 has them, made so to 1e-14 by a step of Newton's. (P, dim, D) -> (P, dim, D)"""
+    """Bases that are orthonormal to 1e-7, as float32 has them, made so to 1e-14 by a step of Newton's. (N, dim, D)"""
     return bases + (np.eye(bases.shape[1]) - bases @ bases.transpose(0, 2, 1)) @ bases / 2
