@@ -135,6 +135,7 @@ class View:
     defense: Defense  # its configuration is public; its randomness is not
     extractor: Extractor
     knowledge: Mapping[Knowledge, Callable[[], Any]] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)  # what the attack says of its run; the record keeps it
 
     def know(self, what: Knowledge) -> Any:
         """Return the knowledge `what`.
@@ -147,6 +148,29 @@ class View:
         if what not in self.knowledge:
             raise PermissionError(f"this attack did not declare {what.name} in its `needs`")
         return self.knowledge[what]()
+
+
+def leads_through_no_word(defense: Defense) -> str | None:
+    """Why the subspaces of that defense go through no word of a database; None if they do."""
+    if not isinstance(defense, Lifting):
+        return f"{defense.name()} does not say how many words its subspaces go through"
+    if defense.adversarial == 0:
+        return f"{defense.name()} as configured leads its subspaces through no word"
+    return None
+
+
+def lifted(view: View) -> tuple[Subspaces, int]:
+    """The subspaces that a lifting released, and how many words of its database each goes through.
+
+    Raises
+    ------
+    TypeError
+        if it is another release, or another defense's.
+    """
+    release, defense = view.release, view.defense
+    if not isinstance(release, Subspaces) or not isinstance(defense, Lifting):
+        raise TypeError(f"expected the Subspaces of a Lifting, got {type(release).__name__} of {type(defense).__name__}")
+    return release, defense.adversarial
 
 
 class Attack(Plugin, ABC):

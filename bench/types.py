@@ -5,7 +5,7 @@ Shapes use N for keypoints, D for a descriptor's length, m for candidates a keyp
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any
 
@@ -77,6 +77,10 @@ class Subspaces(Release):
     @property
     def dim(self) -> int:
         return self.bases.shape[1]
+
+    def take(self, rows: NDArray[Any]) -> Subspaces:
+        """The subspaces of some keypoints, in the order of `rows`: indices, or a mask."""
+        return replace(self, keypoints=self.keypoints[rows], origins=self.origins[rows], bases=self.bases[rows])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

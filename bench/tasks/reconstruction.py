@@ -59,13 +59,13 @@ class Reconstruction(Task):
             return compared(trial, None, reconstructed(attack, view(trial), trial.rng))
         if not isinstance(attack, DescriptorAttack):
             raise UnitError("reconstruction needs an attack")
-        found = recovered(attack, trial)
+        found, told = recovered(attack, trial)
         inverter, undefended, reason = self._inverter(trial.extractor, trial.public)
         if reason is not None:
-            return compared(trial, found, None, (f"no image: {reason}",))
+            return compared(trial, found, None, (*told, f"no image: {reason}"))
         release = Descriptors(keypoints=trial.release.keypoints, size=trial.release.size, descriptors=found)
         seen = view(dataclasses.replace(trial, attack=inverter, defense=undefended, release=release))
-        return compared(trial, found, reconstructed(inverter, seen, trial.rng))
+        return compared(trial, found, reconstructed(inverter, seen, trial.rng), told)
 
     def _inverter(self, extractor: Extractor, public: Public) -> tuple[ImageAttack, Defense, str | None]:
         """The attack that paints descriptors, the defense that it was made for, and why it cannot be used, if it cannot."""
@@ -116,12 +116,13 @@ def reconstructed(attack: ImageAttack, seen: View, rng: np.random.Generator) -> 
     return image
 
 
-def recovered(attack: DescriptorAttack, trial: Trial) -> Floats:
-    """The attacker's descriptors. -> (N, D)"""
+def recovered(attack: DescriptorAttack, trial: Trial) -> tuple[Floats, tuple[str, ...]]:
+    """The attacker's descriptors, (N, D), and what he says of them."""
+    seen = view(trial)
     with blamed(f"plugin {attack.name()}"):
-        descriptors = attack.recover(view(trial), trial.rng)
+        descriptors = attack.recover(seen, trial.rng)
         _expect(descriptors, trial.secret.descriptors.shape)
-    return descriptors
+    return descriptors, tuple(map(str, seen.notes))
 
 
 def compared(trial: Trial, descriptors: Floats | None, image: Floats | None, notes: tuple[str, ...] = ()) -> Outcome:
