@@ -1,0 +1,54 @@
+"""Keypoints: inverts the positions alone, the honest zero line of every defense that releases them.
+
+Positions are released in the clear, so what this attack sees has leaked before any epsilon says something.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from attacks.inversion.encoding import encode
+from attacks.inversion.network import paint
+from attacks.inversion.weights import Network, load, other_features
+from bench.errors import UserError
+from bench.plugin import Asset, Defense, Extractor, ImageAttack, View
+from bench.public import ASSETS, Public
+from bench.types import Descriptors, Floats, Knowledge, Subspaces, WordSets
+
+
+@dataclass(frozen=True, kw_only=True)
+class Keypoints(ImageAttack):
+    """Paints the photograph from the keypoints' positions alone."""
+
+    accepts = (Descriptors, WordSets, Subspaces)
+    needs = frozenset({Knowledge.TRAINING_IMAGES})
+
+    weights: Asset = Asset("shipped")
+
+    def unsuited(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
+        network = self._network()
+        if network.meta["encoding"] != "positions":
+            return "that network reads descriptors; `bench train --encoding positions` makes one that does not"
+        return other_features(network.meta, extractor, public)
+
+    def assets(self, defense: Defense, extractor: Extractor, public: Public) -> Mapping[str, str]:
+        return {"weights": self._network().digest}
+
+    def reconstruct(self, view: View, rng: np.random.Generator) -> Floats:
+        points = encode([view.release], [np.empty(0, np.float32)], 0, "positions")
+        return paint(self._network().module, points)[0].permute(1, 2, 0).cpu().numpy()
+
+    def _network(self) -> Network:
+        if self.weights != "shipped":
+            return load(Path(self.weights))
+        path = ASSETS / "positions.safetensors"
+        if not path.is_file():
+            raise UserError("keypoints: its network is not part of this installation; reinstall, or name a file")
+        return load(path)
+
+
+PLUGIN = Keypoints
