@@ -153,7 +153,7 @@ def nearest_points(one: Subspaces, other: Subspaces) -> tuple[Doubles, Doubles, 
     -------
     (N, D) midpoints of the nearest points of the two, (N,) their distances, and (N,) whether they are the only nearest ones.
     """
-    (p, A), (q, B) = ((part.origins.astype(np.float64), _orthonormal(part.bases.astype(np.float64))) for part in (one, other))
+    (p, A), (q, B) = ((part.origins.astype(np.float64), orthonormal(part.bases.astype(np.float64))) for part in (one, other))
     apart = (q - p)[..., None]  # (N, D, 1)
     G = A @ B.transpose(0, 2, 1)  # (N, dim, dim')
     slope = B @ apart - G.transpose(0, 2, 1) @ (A @ apart)  # (N, dim', 1)
@@ -165,6 +165,6 @@ def nearest_points(one: Subspaces, other: Subspaces) -> tuple[Doubles, Doubles, 
     return p + ((away + mine) / 2)[..., 0], np.linalg.norm((away - mine)[..., 0], axis=1), values[:, 0] > SINGULAR
 
 
-def _orthonormal(bases: Doubles) -> Doubles:
+def orthonormal(bases: Doubles) -> Doubles:
     """Bases that are orthonormal to 1e-7, as float32 has them, made so to 1e-14 by a step of Newton's. (N, dim, D)"""
     return bases + (np.eye(bases.shape[1]) - bases @ bases.transpose(0, 2, 1)) @ bases / 2

@@ -8,8 +8,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.kernels.meetings import orthonormal
 from bench.kernels.subset import log10_chance
-from bench.types import Floats, Indices, Subspaces
+from bench.types import Indices, Subspaces
 
 Doubles = NDArray[np.float64]
 
@@ -38,13 +39,13 @@ def common_points(releases: Sequence[Subspaces]) -> Doubles:
     found = np.empty(first.origins.shape)
     for start in range(0, len(first), BLOCK):
         rows = slice(start, start + BLOCK)
-        B = _orthonormal(first.bases[rows])  # (n, dim, D)
+        B = orthonormal(first.bases[rows].astype(np.float64))  # (n, dim, D)
         o = first.origins[rows].astype(np.float64)  # (n, D)
         p = o - _within(B, o)
         gram = np.zeros((len(B), B.shape[1], B.shape[1]))  # (n, dim, dim)
         pull = np.zeros((len(B), B.shape[1]))  # (n, dim)
         for other in others:
-            frame = _orthonormal(other.bases[rows])
+            frame = orthonormal(other.bases[rows].astype(np.float64))
             shared = B @ frame.transpose(0, 2, 1)  # (n, dim, dim) cosines between directions
             gram += np.eye(B.shape[1]) - shared @ shared.transpose(0, 2, 1)
             offset = other.origins[rows] - p
@@ -52,11 +53,6 @@ def common_points(releases: Sequence[Subspaces]) -> Doubles:
         inverse = np.linalg.pinv(gram, rcond=PARALLEL, hermitian=True)
         found[rows] = p + np.einsum("nij,nj,nid->nd", inverse, pull, B)
     return found
-
-
-def _orthonormal(bases: Floats) -> Doubles:
-    """Bases that were rounded to float32, orthonormal in float64. (n, dim, D) -> (n, dim, D)"""
-    return np.linalg.qr(bases.astype(np.float64).transpose(0, 2, 1))[0].transpose(0, 2, 1)
 
 
 def _within(bases: Doubles, vectors: Doubles) -> Doubles:
