@@ -78,6 +78,7 @@ def test_configuration_holds_the_content_of_files(tmp_path: Path) -> None:
         "epsilon": 10.0,
         "subset_size": 2,
         "dictionary": public.dictionary(small).digest,
+        "words": 0,
     }
     renamed = Asset(Path(small).rename(tmp_path / "renamed.safetensors"))
     assert spec.configuration(LDP(dictionary=renamed), public) == spec.configuration(LDP(epsilon=10, dictionary=small), public)
