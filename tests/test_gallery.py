@@ -18,7 +18,7 @@ from bench.datasets.gallery import Gallery, Shot, shot
 from bench.datasets.scene import Reference, Scene
 from bench.errors import UserError
 from bench.rendering import walks
-from bench.rendering.building import furnish
+from bench.rendering.furniture import furnish
 from bench.rendering.rooms import DOORS, ROOMS, walls
 
 SMALL = Gallery(views=12, queries=6, width=320, height=240, detail=0.4, rooms=1, people=3.0)

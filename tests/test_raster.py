@@ -130,6 +130,15 @@ def test_fine_patterns_far_away_turn_grey() -> None:
     assert aliased.light[30:90, 50:110, 0].std() > 0.05
 
 
+def test_levels_are_blended_and_may_lie_far_apart() -> None:
+    texture = Texture(
+        tuple(np.full((2**size, 2**size, 3), value, np.uint8) for size, value in ((5, 0), (4, 255), (3, 0), (2, 255)))
+    )
+    where = np.full(4, 0.5, np.float32)
+    found = texture.sample(where, where, np.array([0.0, 0.25, 2.5, 2.75], np.float32))[:, 0]
+    np.testing.assert_allclose(found, [0, 0.25, 0.5, 0.75], atol=1e-6)
+
+
 def test_window_shows_part_of_a_texture() -> None:
     halves = np.zeros((64, 64, 3), np.uint8)
     halves[:, 32:] = 255

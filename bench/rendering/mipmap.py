@@ -42,8 +42,8 @@ class Texture:
         level = np.clip(fineness, 0, len(self.levels) - 1.001)
         whole = level.astype(np.int32)
         values = np.empty((len(u), 3), np.float32)
-        for index in range(int(whole.min()), int(whole.max()) + 1):
-            chosen = slice(None) if whole.min() == whole.max() else np.flatnonzero(whole == index)
+        for index in np.flatnonzero(np.bincount(whole)).tolist():
+            chosen = np.flatnonzero(whole == index)
             fine = sample(self.levels[index], u[chosen], v[chosen])
             coarse = sample(self.levels[min(index + 1, len(self.levels) - 1)], u[chosen], v[chosen])
             share = (level[chosen] - index)[:, None]
