@@ -29,6 +29,12 @@ def without_default(plugin: type[Plugin]) -> list[str]:
     return [field.name for field in fields if field.default is dataclasses.MISSING]
 
 
+def defaults(plugin: type[Plugin]) -> dict[str, Any]:
+    """Field name -> default, of the fields that have one."""
+    fields = dataclasses.fields(plugin)  # type: ignore[arg-type]
+    return {field.name: field.default for field in fields if field.default is not dataclasses.MISSING}
+
+
 def expected(kind: Any) -> str | None:
     """What is to be written for a field of this type, in words; None if no field may have it."""
     if get_origin(kind) is Literal:

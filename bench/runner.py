@@ -321,8 +321,11 @@ def _observe(plan: Plan, source: Source) -> tuple[Photograph, Features]:
 
 
 def _protect(plan: Plan, cell: Cell, features: Features, content: str, *repetition: int) -> Release:
-    head = cell.head
-    rng = randomness("release", plan.seed, content, head["defense"], head["dataset"]["extractor"], *repetition)
+    made_with = cell.head["defense"], cell.head["dataset"]["extractor"]
+    if cell.defense.remembers():  # all photographs, and all their repetitions, come from one device
+        rng = randomness("device", plan.seed, *made_with)
+    else:
+        rng = randomness("release", plan.seed, content, *made_with, *repetition)
     with blamed(f"plugin {cell.defense.name()}"):
         release = cell.defense.protect(features, plan.public, rng)
         if not isinstance(release, cell.defense.releases):

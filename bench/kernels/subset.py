@@ -132,18 +132,22 @@ def draw_distinct(rows: int, domain: int, size: int, rng: np.random.Generator) -
 
 
 def word_subsets(true: Indices, domain: int, epsilon: float, size: int, rng: np.random.Generator) -> Indices:
-    """The ω-subset mechanism on K = {0, ..., domain − 1}. true: (N,) -> (N, m), rows ascending"""
-    told = draw_told(len(true), epsilon, domain, size, rng)
-    # Where repetitions are rare, sets that have one are drawn anew: what that costs does not depend on |K|.
-    complete = _with_rejection if size * size <= domain > 1 else _without_repetition
-    return complete(true, told, domain, size, rng)
+    """The ω-subset mechanism on K = {0, ..., domain − 1}. true: (N,) -> (N, m), rows ascending
 
-
-def _with_rejection(true: Indices, told: NDArray[np.bool_], domain: int, size: int, rng: np.random.Generator) -> Indices:
-    """The sets of the mechanism once u is drawn. (N,), (N,) -> (N, m), rows ascending
-
-    m words other than v, drawn one by one, with v in the place of the first where u = 1; sets with a repetition are drawn again.
+    Where repetitions are rare, words are drawn one by one, and only sets with a repetition anew and without. A set is accepted
+    whichever its words are, so both kinds have the law of the theorem, and what this costs does not depend on |K|.
     """
+    told = draw_told(len(true), epsilon, domain, size, rng)
+    if size * size > domain or domain == 1:
+        return _without_repetition(true, told, domain, size, rng)
+    words = _one_by_one(true, told, domain, size, rng)
+    again = _repeating(words)
+    words[again] = _without_repetition(true[again], told[again], domain, size, rng)
+    return words
+
+
+def _one_by_one(true: Indices, told: NDArray[np.bool_], domain: int, size: int, rng: np.random.Generator) -> Indices:
+    """Words other than v, and v in the place of the first where u = 1. (N,), (N,) -> (N, m), rows ascending"""
     words = np.empty((len(true), size), dtype=np.int64)
     for start in range(0, len(true), STEP // size):
         rows = slice(start, start + STEP // size)
@@ -151,9 +155,6 @@ def _with_rejection(true: Indices, told: NDArray[np.bool_], domain: int, size: i
         drawn += drawn >= true[rows]
         np.copyto(drawn[0], true[rows], where=told[rows])
         words[rows] = _ascending(drawn)
-    again = _repeating(words)
-    if len(again):
-        words[again] = _with_rejection(true[again], told[again], domain, size, rng)
     return words
 
 
@@ -178,7 +179,7 @@ def _repeating(rows: Indices) -> Indices:
 
 
 def _without_repetition(true: Indices, told: NDArray[np.bool_], domain: int, size: int, rng: np.random.Generator) -> Indices:
-    """The same for any m up to |K|, by Floyd's algorithm. (N,), (N,) -> (N, m), rows ascending"""
+    """The sets of the mechanism once u is drawn, for any m up to |K|. (N,), (N,) -> (N, m), rows ascending"""
     words = np.empty((len(true), size), dtype=np.int64)
     for u in (0, 1):
         rows = np.flatnonzero(told == u)
