@@ -60,7 +60,8 @@ class LDP(Defense):
             words = self._answers(np.arange(len(known)), known, rng)[nearest]  # (N, m)
         else:
             words = self._answers(nearest, known, rng)  # (N, m)
-        candidates = unit_rows(known.words[words])  # (N, m, D)
+        distinct, places = np.unique(words, return_inverse=True)
+        candidates = unit_rows(known.words[distinct])[places.reshape(words.shape)]  # (N, m, D)
         return WordSets(keypoints=secret.keypoints.copy(), size=secret.size, candidates=candidates, words=words)
 
     def privacy(self, public: Public) -> Privacy:
