@@ -23,7 +23,7 @@ class Exact(float):
         infinite = str(value).strip().lstrip("+-").lower() in INFINITE
         try:
             fraction = None if infinite else exact(value)
-            found = super().__new__(cls, value if fraction is None else fraction)  # type: ignore[arg-type]  # has __float__
+            found = super().__new__(cls, value if fraction is None else fraction)
         except (ZeroDivisionError, OverflowError) as error:
             raise ValueError(f"{value!r}: {error}") from None
         found.fraction = fraction

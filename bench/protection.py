@@ -37,9 +37,10 @@ def protect(features: Features, defense: Defense, public: Public | None = None, 
         if the defense's dictionary is missing or damaged, or does not fit the features; or the key is.
     """
     public = public or Public()
-    if defense.remembers() != (device is not None):
-        wrong = "needs the file of the device's key: protect(..., device=PATH)" if device is None else "does not use a device's key"
-        raise UserError(f"{defense.name()} as configured {wrong}")
+    if defense.remembers() and device is None:
+        raise UserError(f"{defense.name()}, as configured, needs the file of the device's key: protect(..., device=PATH)")
+    if device is not None and not defense.remembers():
+        raise UserError(f"{defense.name()}, as configured, does not remember: a key would make all releases draw alike")
     key = secrets.token_bytes(KEY) if device is None else _derived(_device_key(Path(device)), defense, public)
     return defense.protect(features, public, generator(key))
 
@@ -59,10 +60,7 @@ def _derived(key: bytes, defense: Defense, public: Public) -> bytes:
 
 def _device_key(path: Path) -> bytes:
     try:
-        with (
-            contextlib.suppress(FileExistsError),
-            path.open("xb", opener=lambda name, flags: os.open(name, flags, 0o600)) as file,
-        ):
+        with contextlib.suppress(FileExistsError), open(path, "xb", opener=_for_the_owner_alone) as file:
             file.write(secrets.token_bytes(KEY))
         key = path.read_bytes()
     except OSError as error:
@@ -70,3 +68,7 @@ def _device_key(path: Path) -> bytes:
     if len(key) != KEY:
         raise UserError(f"{path}: a device's key has {KEY} bytes, this file {len(key)}")
     return key
+
+
+def _for_the_owner_alone(name: str, flags: int) -> int:
+    return os.open(name, flags, 0o600)

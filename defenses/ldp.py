@@ -20,7 +20,7 @@ from bench.kernels.search import unit_rows
 from bench.kernels.subset import log10_chance, word_subsets
 from bench.plugin import Asset, Between, Defense, OneOf, Privacy
 from bench.public import Public
-from bench.types import Features, Indices, WordSets
+from bench.types import Features, WordSets
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,10 +56,10 @@ class LDP(Defense):
     def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> WordSets:
         known = self._known(public)
         nearest = public.nearest_words(self.dictionary, secret, self.words)  # (N,) d'
-        if self.memoize:  # all answers are drawn, so that what is drawn does not depend on the secret
-            words = self._answers(np.arange(len(known)), known, rng)[nearest]  # (N, m)
-        else:
-            words = self._answers(nearest, known, rng)  # (N, m)
+        # A device that remembers draws its answers to all words, whichever it is asked for.
+        asked = np.arange(len(known)) if self.memoize else nearest
+        answers = word_subsets(asked, len(known), self.epsilon, self.subset_size, rng)
+        words = answers[nearest] if self.memoize else answers  # (N, m)
         distinct, places = np.unique(words, return_inverse=True)
         candidates = unit_rows(known.words[distinct])[places.reshape(words.shape)]  # (N, m, D)
         return WordSets(keypoints=secret.keypoints.copy(), size=secret.size, candidates=candidates, words=words)
@@ -72,9 +72,6 @@ class LDP(Defense):
 
     def remembers(self) -> bool:
         return self.memoize
-
-    def _answers(self, true: Indices, known: Dictionary, rng: np.random.Generator) -> Indices:
-        return word_subsets(true, len(known), self.epsilon, self.subset_size, rng)
 
     def _known(self, public: Public) -> Dictionary:
         """The dictionary, once it is known to hold enough words."""

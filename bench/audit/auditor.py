@@ -1,8 +1,8 @@
 """Audits a defense's ε: bounds it from below by what `protect` releases, and looks for what an ε-LDP defense cannot do.
 
-For any event E and any two descriptors, an ε-LDP release has Pr(E | d1) ≤ e^ε Pr(E | d2). Two descriptors are released many times.
-On one half of the calls the event of each family is chosen that tells most; on the other half its two rates are measured. What
-`protect` does with a descriptor, the quantiser included, is a black box.
+For any event E and any two descriptors, an ε-LDP release has Pr(E | d1) ≤ e^ε Pr(E | d2). Two descriptors are released many
+times. On one half of the calls the event of each family is chosen that tells most; on the other half its two rates are measured.
+What `protect` does with a descriptor, the quantiser included, is a black box.
 
 - membership: one word is released, and another is not
 - position: one word stands in one place of its row, and another is not released
@@ -10,11 +10,11 @@ On one half of the calls the event of each family is chosen that tells most; on 
 - keypoints: the answers to two keypoints of one call have so many words in common
 - calls: the answers to one keypoint in two calls have so many words in common
 
-The last two compare (d1, d1) with (d1, d2): one descriptor changes, so ε bounds these ratios, too. A defense that remembers does not
-promise that. All pairs of words are compared by enumeration, where the dictionary is small.
+The last two compare (d1, d1) with (d1, d2): one descriptor changes, so ε bounds these ratios, too. A defense that remembers does
+not promise that. All pairs of words are compared by enumeration, where the dictionary is small.
 
-Many keypoints of one call count as many trials, which presumes that a keypoint's answer depends on its own descriptor and on chance.
-Where answers of one call are more alike than that allows, one keypoint of each call counts and the others do not.
+Many keypoints of one call count as many trials, which presumes that a keypoint's answer depends on its own descriptor and on
+chance. Where answers of one call are more alike than that allows, one keypoint of each call counts and the others do not.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ import numpy as np
 
 from bench import fields
 from bench.audit.events import Answers, answers, common, watch
-from bench.audit.exhaustive import NotEnumerable, greatest_ratio, law
+from bench.audit.exhaustive import NotEnumerableError, greatest_ratio, law
 from bench.audit.findings import Finding, Tally
 from bench.errors import UserError
 from bench.exact import exact
@@ -112,9 +112,9 @@ def audit(defense: Defense, words: int | None, trials: int, seed: int, folder: P
     enumeration = None
     try:
         if words is None or words > ENUMERATED:
-            raise NotEnumerable(f"that takes a dictionary of at most {ENUMERATED} words")
+            raise NotEnumerableError(f"that takes a dictionary of at most {ENUMERATED} words")
         enumeration = enumerated(defense, secrets, public, claimed)
-    except NotEnumerable as reason:
+    except NotEnumerableError as reason:
         notes.append(f"outputs were not enumerated: {reason}")
     return Audit(claimed, findings, enumeration, tuple(notes))
 
@@ -122,7 +122,8 @@ def audit(defense: Defense, words: int | None, trials: int, seed: int, folder: P
 def near_words(defense: Defense, public: Public) -> Features:
     """Features near each word of the defense's dictionary, but not on it."""
     (asset,) = fields.asset_fields(defense).values()
-    words = public.dictionary(asset, 0 if defense.truncated_by is None else getattr(defense, defense.truncated_by)).words  # (K, D)
+    used = 0 if defense.truncated_by is None else getattr(defense, defense.truncated_by)
+    words = public.dictionary(asset, used).words  # (K, D)
     aside = np.random.default_rng(0).integers(-2, 2, size=words.shape, endpoint=True)
     codes = np.clip(words + aside, 0, 255).astype(np.uint8)
     return dataclasses.replace(example_features(len(codes)), descriptors=unit_rows(codes), codes=codes)
@@ -133,7 +134,7 @@ def enumerated(defense: Defense, secrets: Features, public: Public, claimed: flo
 
     Raises
     ------
-    NotEnumerable
+    NotEnumerableError
         if there are too many courses, or the defense draws in a way that is not played.
     """
 
@@ -172,7 +173,8 @@ def _findings(defense: Defense, secrets: Features, public: Public, trials: int, 
         return found.take(slice(0, None, 2)), found.take(slice(1, None, 2))
 
     pilots = [(released(alike, 0, call)[1], released(mixed, 1, call)[1]) for call in range(PILOTS)]
-    watched = watch(*zip(*pilots, strict=True), secrets.descriptors[0] - secrets.descriptors[1])
+    direction = secrets.descriptors[0] - secrets.descriptors[1]
+    watched = watch([one for one, _ in pilots], [other for _, other in pilots], direction)
     tallies: dict[str, Tally] = {}
     before: Answers | None = None
     for call in range(calls):

@@ -27,7 +27,7 @@ def log_ratio(hits: Any, trials: Any, other_hits: Any, other_trials: Any, confid
         return np.log(least) - np.log(most)
 
 
-def more_alike_than_independent(hits: NDArray[np.int64], places: int, chance: float = 1e-6) -> bool:
+def more_alike_than_independent(hits: NDArray[np.integer[Any]], places: int, chance: float = 1e-6) -> bool:
     """Whether counts of so many places each vary more than binomial ones do, as they may with that chance at most. hits: (C,)"""
     share = hits.mean() / places
     if places == 1 or len(hits) < 2 or share in (0, 1):

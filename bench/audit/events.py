@@ -91,8 +91,8 @@ class Watched:
 
     def families(self) -> dict[str, Callable[[Answers], Flags]]:
         """Those that there are events of."""
-        found = {"membership": self.membership, "position": self.position}
-        return {**found, "projection": self.projection} if len(self.thresholds) else found
+        found: dict[str, Callable[[Answers], Flags]] = {"membership": self.membership, "position": self.position}
+        return found | {"projection": self.projection} if len(self.thresholds) else found
 
     def names(self, places: int) -> dict[str, list[str]]:
         """What the events of each family are, in their order, where so many words are released for a keypoint."""

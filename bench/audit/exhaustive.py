@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -40,7 +41,7 @@ class Law:
 OPEN = Law({}, Fraction(1))
 
 
-class NotEnumerable(UserError):
+class NotEnumerableError(UserError):
     """The function has too many courses, or draws in a way that cannot be played."""
 
 
@@ -54,14 +55,14 @@ def law(function: Randomised, runs: int = 200_000) -> Law:
 
     Raises
     ------
-    NotEnumerable
+    NotEnumerableError
         if they are not enough, or the function draws in another way.
     """
     return _Explorer(function, runs).after(())
 
 
 def greatest_ratio(laws: Sequence[Law]) -> tuple[Fraction | None, Fraction | None]:
-    """Bounds, from below and above, of how many times as likely as under another of the laws an outcome can be. None is infinite."""
+    """Bounds, from below and above, of the greatest quotient of two laws' probabilities of one outcome. None is infinite."""
     outcomes = {outcome for each in laws for outcome in each.chances}
     least = [[each.chances.get(outcome, Fraction(0)) for each in laws] for outcome in outcomes]
     most = [[each.at_most(outcome) for each in laws] for outcome in outcomes]
@@ -84,7 +85,7 @@ class _Explorer:
         """The law once the first draws came out as in `course`."""
         self._runs -= 1
         if self._runs < 0:
-            raise NotEnumerable("its draws can take too many courses")
+            raise NotEnumerableError("its draws can take too many courses")
         try:
             return Law({self._function(_Player(course)): Fraction(1)})  # type: ignore[arg-type]
         except _Unplayed as draw:
@@ -109,13 +110,14 @@ class _Explorer:
                 return [(at(low), share)]
             if share < NEGLIGIBLE:
                 return [(OPEN, share)]
-            middle = low + max(1, (high - low) * 13 // 21)  # not the middle: draws that equal a threshold may lead to further ones
+            # Not the very middle, which may be a threshold; a draw that equals one may lead to more draws without end.
+            middle = low + max(1, (high - low) * 13 // 21)
             return between(low, middle) + between(middle, high)
 
         edge = int(outcomes * NEGLIGIBLE / 2)
         first, last = edge, outcomes - 1 - edge
         places = [first + (last - first) * k // PROBES for k in range(PROBES + 1)]
-        parts = [part for pair in zip(places, places[1:], strict=False) for part in between(*pair)]
+        parts = [part for pair in pairwise(places) for part in between(*pair)]
         return _mixture([*parts, (at(last), Fraction(1, outcomes)), (OPEN, Fraction(2 * edge, outcomes))])
 
 
@@ -143,7 +145,7 @@ class _Player:
         self._course = iter(course)
 
     def __getattr__(self, name: str) -> Any:
-        raise NotEnumerable(f"it draws by rng.{name}, which is not played")
+        raise NotEnumerableError(f"it draws by rng.{name}, which is not played")
 
     def _number(self, outcomes: int) -> int:
         if outcomes == 1:
@@ -162,7 +164,7 @@ class _Player:
 
     def integers(self, low: Any, high: Any = None, size: Any = None, dtype: Any = np.int64, endpoint: bool = False) -> Any:
         if np.ndim(low) or np.ndim(high):
-            raise NotEnumerable("it draws by rng.integers from many ranges at once, which is not played")
+            raise NotEnumerableError("it draws by rng.integers from many ranges at once, which is not played")
         first, end = (0, int(low)) if high is None else (int(low), int(high))
         return self._array(lambda: first + self._number(end - first + endpoint), size, dtype)
 
@@ -174,7 +176,7 @@ class _Player:
 
     def choice(self, a: Any, size: Any = None, replace: bool = True, p: Any = None) -> Any:
         if p is not None:
-            raise NotEnumerable("it draws by rng.choice with weights, which is not played")
+            raise NotEnumerableError("it draws by rng.choice with weights, which is not played")
         left = list(range(a)) if np.ndim(a) == 0 else list(a)
 
         def draw() -> Any:

@@ -54,7 +54,7 @@ class Tally:
         half = len(hits) // 2
         chosen_by, trials = hits[:half].sum(axis=0), half * places
         bounds = log_ratio(chosen_by, trials, chosen_by[::-1], trials, CONFIDENCE)  # (2, E)
-        way, event = np.unravel_index(bounds.argmax(), bounds.shape)
+        way, event = divmod(int(bounds.argmax()), bounds.shape[1])
         order = [way, 1 - way]
         alike = any(more_alike_than_independent(hits[:half, given, event], places) for given in order)
         counted = np.stack(self.first) if alike else hits

@@ -14,6 +14,6 @@ def row_keys(rows: Bytes | Floats) -> NDArray[np.uint64]:
     Rows are compared bit by bit; they have a multiple of 8 bytes.
     """
     lanes = np.ascontiguousarray(rows).view(np.uint64)  # (..., D itemsize / 8)
-    factors = 2 * np.random.default_rng(0).integers(2**63, size=lanes.shape[-1], dtype=np.uint64) + 1  # odd
+    factors = 2 * np.random.default_rng(0).integers(2**63, size=lanes.shape[-1:], dtype=np.uint64) + 1  # odd
     mixed = lanes * factors  # wraps around
     return ((mixed ^ (mixed >> np.uint64(29))) * factors[::-1]).sum(axis=-1, dtype=np.uint64)

@@ -95,6 +95,35 @@ def log10_chance(epsilon: float, domain: int, size: int) -> float:
     return -float(np.logaddexp(0.0, odds_against)) / math.log(10)
 
 
+def information(epsilon: float, domain: int, sizes: Indices) -> NDArray[np.float64]:
+    """What a released set tells of a uniform true word, for each size m: their mutual information in nats. (S,) -> (S,)
+
+    I = p ε + ln(|K| / (m e^ε + |K| − m)), as a set holds the true word with probability p and all sets are equally likely.
+    """
+    m = sizes.astype(np.float64)
+    with np.errstate(divide="ignore"):
+        total = np.logaddexp(np.log(m) + epsilon, np.log(domain - m))
+    return np.exp(np.log(m) + epsilon - total) * epsilon + math.log(domain) - total
+
+
+def most_informative_size(epsilon: float, domain: int) -> int:
+    """The size m < |K| at which a set tells most of the true word.
+
+    It is about |K| (ε e^ε − e^ε + 1) / (e^ε − 1)², where I has no slope (Wang et al., arXiv:1607.08025).
+    """
+    sizes = np.arange(1, domain)
+    return 1 if math.isinf(epsilon) else int(sizes[information(epsilon, domain, sizes).argmax()])
+
+
+def most_accurate_size(epsilon: float, domain: int) -> int:
+    """The size at which sets of many people tell the frequencies of words best: |K| / (e^ε + 1) (Ye and Barg, arXiv:1702.00610).
+
+    A set then holds the true word with a chance of about one half. Both sizes tend to |K| / 2 for small ε, and part for large.
+    """
+    share = math.exp(-epsilon) / (1 + math.exp(-epsilon))
+    return min(domain - 1, max(1, round(domain * share)))
+
+
 def draw_told(rows: int, epsilon: float, domain: int, size: int, rng: np.random.Generator) -> NDArray[np.bool_]:
     """Draw u for each row: whether a uniform number in [0, 1) is below p, both read bit by bit. -> (N,)
 
