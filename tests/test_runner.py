@@ -22,7 +22,7 @@ from bench.plugin import Asset, Attack, Defense, Task, View
 from bench.records import FILE, Record
 from bench.tasks.reconstruction import Reconstruction
 from bench.testing import small_dictionary
-from bench.types import Descriptors, Knowledge
+from bench.types import Knowledge
 from defenses.affine import Affine
 from defenses.ldp import LDP
 from defenses.none import Undefended
@@ -303,17 +303,3 @@ def test_damaged_records_stop_the_run_before_it_starts(images: Path, tmp_path: P
     with pytest.raises(UserError, match="line 1"):
         run([Undefended()], [Painter()], images, out=tmp_path / "out")
     assert file.read_bytes() == b"nonsense\n{}\n"
-
-
-# ---- protecting for real
-
-
-def test_protect_draws_from_the_operating_system(small: Asset) -> None:
-    import bench
-    from bench.testing import example_features, same
-
-    features, defense = example_features(), LDP(dictionary=small)
-    assert not same(bench.protect(features, defense), bench.protect(features, defense))
-    seeded = [bench.protect(features, defense, np.random.default_rng(0)) for _ in range(2)]
-    assert same(*seeded)
-    assert isinstance(bench.protect(features, Undefended()), Descriptors)
