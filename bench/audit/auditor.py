@@ -43,9 +43,9 @@ from bench.types import Features
 TIGHT = 0.9  # of the claimed ε, from which on a bound is called tight
 PLACES = 500  # pairs of keypoints in a call
 CALLS = 400  # at least, where there are so many trials
-PILOTS = 40  # calls that choose what to look for; they are not counted
+PILOTS = 20  # calls that choose what to look for; they are not counted
 ENUMERATED = 6  # words of a dictionary, at most, whose outputs are enumerated
-RUNS = 50_000  # of the enumeration, for each word
+RUNS = 20_000  # of the enumeration, for each word
 DIGITS = Context(prec=50)
 
 LINKED = "equal descriptors get equal answers, which no epsilon covers: keypoints and calls were not compared"
@@ -113,6 +113,8 @@ def audit(defense: Defense, words: int | None, trials: int, seed: int, folder: P
     try:
         if words is None or words > ENUMERATED:
             raise NotEnumerableError(f"that takes a dictionary of at most {ENUMERATED} words")
+        if defense.remembers():
+            raise NotEnumerableError("a device that remembers draws its answers to all words at once")
         enumeration = enumerated(defense, secrets, public, claimed)
     except NotEnumerableError as reason:
         notes.append(f"outputs were not enumerated: {reason}")

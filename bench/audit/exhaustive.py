@@ -2,9 +2,9 @@
 
 The function is handed a generator that does not draw, but plays one course after another. A draw from more than `SMALL` numbers
 (64 random bits, a double in [0, 1)) is not played number by number: where two numbers lead to one law, all between them are taken
-to do so, and where they do not, bisection finds the border. That is exact for a function which compares such a draw with
-thresholds, as samplers do, and looks at `PROBES` places between which it must not change its mind twice. What lies closer to a
-border than `NEGLIGIBLE` is left open, and accounted for.
+to do so, and where they do not, bisection finds the border. That is exact for a function which compares such a draw with one
+threshold, as samplers do; numbers at `PROBES` more places tell where that is not so. What lies nearer to a border than
+`NEGLIGIBLE` is left open, and accounted for.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,7 @@ import numpy as np
 from bench.errors import UserError
 
 SMALL = 1024  # outcomes
-PROBES = 8
+PROBES = 12
 NEGLIGIBLE = Fraction(1, 2**60)
 DOUBLE = 2**53  # outcomes of a double in [0, 1)
 
@@ -103,22 +102,24 @@ class _Explorer:
                 known[k] = self.after((*course, k))
             return known[k]
 
-        def between(low: int, high: int) -> list[tuple[Law, Fraction]]:
-            """Laws with their shares of the numbers low, ..., high − 1."""
-            share = Fraction(high - low, outcomes)
+        def between(low: int, high: int) -> list[tuple[int, int, Law]]:
+            """Ranges that cover low, ..., high − 1, and the law of each."""
             if high - low == 1 or at(low) == at(high):
-                return [(at(low), share)]
-            if share < NEGLIGIBLE:
-                return [(OPEN, share)]
+                return [(low, high, at(low))]
+            if Fraction(high - low, outcomes) < NEGLIGIBLE:
+                return [(low, high, OPEN)]
             # Not the very middle, which may be a threshold; a draw that equals one may lead to more draws without end.
             middle = low + max(1, (high - low) * 13 // 21)
             return between(low, middle) + between(middle, high)
 
         edge = int(outcomes * NEGLIGIBLE / 2)
-        first, last = edge, outcomes - 1 - edge
-        places = [first + (last - first) * k // PROBES for k in range(PROBES + 1)]
-        parts = [part for pair in pairwise(places) for part in between(*pair)]
-        return _mixture([*parts, (at(last), Fraction(1, outcomes)), (OPEN, Fraction(2 * edge, outcomes))])
+        last = outcomes - 1 - edge
+        ranges = [*between(edge, last), (last, last + 1, at(last)), (0, edge, OPEN), (last + 1, outcomes, OPEN)]
+        for probe in np.random.default_rng(0).random(PROBES):
+            k = edge + int(probe * (last - edge))
+            if any(low <= k < high and expected not in (at(k), OPEN) for low, high, expected in ranges):
+                raise NotEnumerableError("it does not compare random bits with thresholds alone")
+        return _mixture((each, Fraction(high - low, outcomes)) for low, high, each in ranges)
 
 
 def _mixture(parts: Iterable[tuple[Law, Fraction]]) -> Law:
