@@ -86,8 +86,8 @@ def nearest(records: Sequence[Record], epsilon: float) -> list[Record]:
     UserError
         if none claims one.
     """
-    claimed = [float(record["privacy"]["epsilon_descriptor"] or "nan") for record in records]
-    distances = np.abs(np.array(claimed) - epsilon)
+    claimed = [record["privacy"]["epsilon_descriptor"] for record in records]
+    distances = np.abs(np.array([math.nan if value is None else float(value) for value in claimed]) - epsilon)
     if np.isnan(distances).all():
         raise UserError("--results: no record there claims an epsilon")
     return [record for record, distance in zip(records, distances, strict=True) if distance == np.nanmin(distances)]

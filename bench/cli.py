@@ -375,6 +375,7 @@ def _budget(args: argparse.Namespace) -> int:
     _print_rich(*budget.report(plan))
     if args.results is not None:
         measured = budget.nearest(records.read(records.find(args.results)).records, plan.epsilon)
+        print(f"The nearest that was measured: ε = {float(measured[0]['privacy']['epsilon_descriptor']):g} for a descriptor")
         _print_rich(*(tables.to_rich(table) for table in tables.tables(measured)))
     return DONE
 

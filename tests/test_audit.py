@@ -65,6 +65,11 @@ def test_answers_that_are_too_much_alike_are_noticed() -> None:
     assert not any(more_alike_than_independent(rng.binomial(500, share, 200), 500) for share in (0.001, 0.1, 0.5, 1.0))
     assert more_alike_than_independent(500 * rng.binomial(1, 0.1, 200), 500)
     assert more_alike_than_independent(rng.binomial(500, rng.beta(30, 70, 200)), 500)
+    # Of rare events, two may fall into one call; not five hundred.
+    rare = [rng.binomial(500, 1e-5, 1000) for _ in range(300)]
+    assert any(counts.max() == 2 for counts in rare)
+    assert not any(more_alike_than_independent(counts, 500) for counts in rare)
+    assert more_alike_than_independent(500 * (np.arange(1000) == 7), 500)
 
 
 # ---- sound defenses
@@ -152,7 +157,8 @@ def test_what_is_remembered_counts_once_a_call(tmp_path: Path) -> None:
     found = audited(LDP(epsilon=2.0, memoize=True), tmp_path, words=16)
     assert found.verdict == "consistent"
     assert [finding.family for finding in found.findings] == ["membership", "position"]
-    assert all(finding.alike and finding.trials < TRIALS / 20 for finding in found.findings)
+    assert found.strongest.epsilon > 1.5
+    assert all(finding.alike and finding.trials < TRIALS / 2 for finding in found.findings)
     assert any("linked" in note or "equal answers" in note for note in found.notes)
 
 

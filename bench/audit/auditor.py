@@ -43,6 +43,7 @@ from bench.types import Features
 TIGHT = 0.9  # of the claimed ε, from which on a bound is called tight
 PLACES = 500  # pairs of keypoints in a call
 CALLS = 400  # at least, where there are so many trials
+DEVICES = 10_000  # the same, of a defense that remembers: each call is another device
 PILOTS = 20  # calls that choose what to look for; they are not counted
 ENUMERATED = 6  # words of a dictionary, at most, whose outputs are enumerated
 RUNS = 20_000  # of the enumeration, for each word
@@ -108,7 +109,8 @@ def audit(defense: Defense, words: int | None, trials: int, seed: int, folder: P
     secrets = example_features(2, seed) if words is None else near_words(defense, public)
     findings = tuple(_findings(defense, secrets.take(np.array([0, len(secrets) - 1])), public, trials, seed))
     notes = [LINKED] if defense.remembers() else []
-    notes += [ALIKE.format(finding.family) for finding in findings if finding.alike]
+    if alike := [finding.family for finding in findings if finding.alike]:
+        notes.append(ALIKE.format(", ".join(alike)))
     enumeration = None
     try:
         if words is None or words > ENUMERATED:
@@ -164,7 +166,7 @@ def _reporting_from(defense: Defense, words: int, seed: int, folder: Path) -> De
 
 def _findings(defense: Defense, secrets: Features, public: Public, trials: int, seed: int) -> Iterator[Finding]:
     """Release two descriptors again and again, and yield what each family of events shows."""
-    places = max(1, min(PLACES, trials // CALLS))
+    places = max(1, min(PLACES, trials // (DEVICES if defense.remembers() else CALLS)))
     calls = 4 * -(-trials // (4 * places))
     alike = secrets.take(np.zeros(2 * places, dtype=np.int64))  # pairs (d1, d1)
     mixed = secrets.take(np.arange(2 * places) % 2)  # pairs (d1, d2)

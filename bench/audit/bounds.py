@@ -28,9 +28,13 @@ def log_ratio(hits: Any, trials: Any, other_hits: Any, other_trials: Any, confid
 
 
 def more_alike_than_independent(hits: NDArray[np.integer[Any]], places: int, chance: float = 1e-6) -> bool:
-    """Whether counts of so many places each vary more than binomial ones do, as they may with that chance at most. hits: (C,)"""
-    share = hits.mean() / places
-    if places == 1 or len(hits) < 2 or share in (0, 1):
+    """Whether counts of so many places each are further apart than binomial ones, which are so with that chance. hits: (C,)"""
+    calls, total = len(hits), int(hits.sum())
+    share = total / (calls * places)
+    if places == 1 or share in (0, 1):
         return False
+    crowded = calls * stats.binom.sf(hits.max() - 1, places, share)  # that one of them is so large
+    if total < calls:  # too few for χ²
+        return bool(crowded < chance)
     index = float(np.square(hits - hits.mean()).sum()) / (places * share * (1 - share))
-    return bool(stats.chi2.sf(index, len(hits) - 1) < chance)
+    return bool(min(crowded, stats.chi2.sf(index, calls - 1)) < chance)

@@ -52,17 +52,23 @@ class Tally:
         """
         hits = np.stack(self.hits)  # (C, 2, E)
         half = len(hits) // 2
-        chosen_by, trials = hits[:half].sum(axis=0), half * places
-        bounds = log_ratio(chosen_by, trials, chosen_by[::-1], trials, CONFIDENCE)  # (2, E)
-        way, event = divmod(int(bounds.argmax()), bounds.shape[1])
-        order = [way, 1 - way]
-        alike = any(more_alike_than_independent(hits[:half, given, event], places) for given in order)
-        counted = np.stack(self.first) if alike else hits
-        measured = counted[half:, order, event].sum(axis=0)  # (2,)
-        trials = half if alike else half * places
+        given, event, expected = _most_telling(hits[:half], half * places)
+        alike = any(more_alike_than_independent(hits[:half, either, event], places) for either in (0, 1))
+        if alike:
+            hits, places = np.stack(self.first).astype(np.int32), 1
+            given, event, expected = _most_telling(hits[:half], half)
+        trials = half * places
+        one, other = (int(hits[half:, either, event].sum()) for either in (given, 1 - given))
         epsilon, certain = (
-            max(0.0, float(log_ratio(measured[0], trials, measured[1], trials, confidence)))
+            max(0.0, float(log_ratio(one, trials, other, trials, confidence)))
             for confidence in (CONFIDENCE, 1 - (1 - CERTAINTY) / families)
         )
-        rates = (float(measured[0]) / trials, float(measured[1]) / trials)
-        return Finding(family, names[event], rates, trials, epsilon, certain, float(bounds[way, event]), alike)
+        return Finding(family, names[event], (one / trials, other / trials), trials, epsilon, certain, expected, alike)
+
+
+def _most_telling(hits: NDArray[np.int32], trials: int) -> tuple[int, int, float]:
+    """The input under which, and the event of which, the bound is greatest; and that. hits: (C, 2, E)"""
+    counts = hits.sum(axis=0)  # (2, E)
+    bounds = log_ratio(counts, trials, counts[::-1], trials, CONFIDENCE)
+    given, event = divmod(int(bounds.argmax()), bounds.shape[1])
+    return given, event, float(bounds[given, event])

@@ -19,15 +19,10 @@ def report(found: Audit, defense: str) -> Iterator[Text | Table]:
         title_justify="left",
         caption_justify="left",
     )
-    for column in (
-        "events",
-        "the most telling",
-        "rate",
-        "rate for the other",
-        "trials of each",
-        f"ε at least ({CONFIDENCE:.0%})",
-    ):
-        table.add_column(column, justify="left" if column in ("events", "the most telling") else "right", overflow="fold")
+    for column in ("events", "the most telling"):
+        table.add_column(column, overflow="fold")
+    for column in ("rate", "rate for the other", "trials of each", f"ε at least ({CONFIDENCE:.0%})"):
+        table.add_column(column, justify="right")
     for finding in found.findings:
         one, other = finding.rates
         table.add_row(
@@ -39,10 +34,8 @@ def report(found: Audit, defense: str) -> Iterator[Text | Table]:
             "all outputs enumerated: the greatest ratio of two words' probabilities is e^ε "
             f"for ε from {found.enumeration.low:.15g} to {found.enumeration.high:.15g}"
         )
-    strongest = found.strongest
-    yield Text(
-        f"ε is at least {strongest.epsilon:.4f}, by {strongest.family}, with confidence {CONFIDENCE:.0%}: {_judgement(found)}"
-    )
+    bound = f"ε is at least {found.strongest.epsilon:.4f} with confidence {CONFIDENCE:.0%}, by {found.strongest.family}"
+    yield Text(f"{bound}: {_judgement(found)}")
 
 
 def _judgement(found: Audit) -> str:
