@@ -24,7 +24,7 @@ BROKEN_PIPE = 141  # as a shell reports a program that SIGPIPE ended
 GO_ON = "what was written is kept; run the same command again to go on"
 PIPED_WIDTH = 400  # columns of a table that goes to a file: its cells are not folded, so that they can be searched
 
-COMMANDS = ("run", "list", "reproduce", "dictionary", "train", "dataset")
+COMMANDS = ("run", "list", "reproduce", "dictionary", "train", "dataset", "audit", "budget")
 
 EXAMPLES = """examples:
   bench run --defense ldp --attack dia
@@ -34,8 +34,11 @@ EXAMPLES = """examples:
   bench train --defense ldp --images DIR --out W.safetensors
   bench dataset gallery --layout colmap --out DIR
   bench reproduce table1
+  bench audit --defense ldp:epsilon=2,subset_size=2 --words 64 --trials 1000000
+  bench budget --image-epsilon 10
 
-exit status: 0 done, 1 some photograph failed (all else is done and written), 2 a mistake in what was asked (nothing is written)
+exit status: 0 done, 1 some photograph failed (all else is done and written) or an audit found a violation,
+2 a mistake in what was asked (nothing is written)
 """
 RUN_EXAMPLES = """A plugin is written name:field=value,field=value; `bench list` shows names and fields.
 Repeated options make a grid.
@@ -83,15 +86,15 @@ def _command(argv: list[str]) -> int:
     _check_commands(argv)
     args, extra = _parser().parse_known_args(argv)
     if "command" not in args:
-        raise UserError("say what to do: run, list, reproduce, dictionary build, train or dataset (bench --help explains)")
+        raise UserError(f"say what to do: {', '.join(COMMANDS)} (bench --help explains)")
     if extra:
         option = extra[0].partition("=")[0]
         if option.startswith("-"):
             raise unknown("option", option, set(re.findall(r"--[a-z][a-z-]*", args.options)))
         raise UserError(f"{extra[0]!r} is one argument too many")
     for option in args.required:
-        if not getattr(args, option):
-            raise UserError(f"--{option} is missing (bench {' '.join(argv[:1])} --help explains)")
+        if getattr(args, option) in (None, ""):
+            raise UserError(f"--{option.replace('_', '-')} is missing (bench {' '.join(argv[:1])} --help explains)")
     return int(args.command(args))
 
 
@@ -208,6 +211,25 @@ def _parser() -> argparse.ArgumentParser:
             f"--{network}-network", metavar="FILE", help=f"weights trained for `{defense}` (default: shipped ones)"
         )
     reproduce.set_defaults(command=_reproduce, required=("what",), options=reproduce.format_help())
+
+    audit = add(commands, "audit", "bound a defense's epsilon from below by what it releases; exit status 1 if it is violated")
+    audit.add_argument("--defense", metavar="SPEC", help="one that claims an epsilon")
+    audit.add_argument("--words", type=_whole, metavar="K", help="of a made-up dictionary to report from (default: its own)")
+    audit.add_argument(
+        "--trials", type=_whole, default=100_000, metavar="N", help="releases of each of two descriptors (default: %(default)s)"
+    )
+    audit.add_argument("--seed", type=_whole, default=0, metavar="N", help="of everything random (default: %(default)s)")
+    audit.set_defaults(command=_audit, required=("defense",), options=audit.format_help())
+
+    budget = add(commands, "budget", "say what an epsilon for a whole photograph leaves for each descriptor, and what that buys")
+    budget.add_argument("--image-epsilon", type=_number, metavar="E", help="of a photograph, in all")
+    budget.add_argument("--keypoints", type=_whole, default=1000, metavar="N", help="of a photograph (default: %(default)s)")
+    budget.add_argument("--releases", type=_whole, default=1, metavar="T", help="of the photograph (default: %(default)s)")
+    budget.add_argument("--words", type=_whole, metavar="K", help="of the dictionary (default: those of the shipped one)")
+    budget.add_argument(
+        "--results", type=Path, metavar="DIR", help="of bench run: shows what was measured at the nearest epsilon"
+    )
+    budget.set_defaults(command=_budget, required=("image_epsilon",), options=budget.format_help())
     return parser
 
 
@@ -330,6 +352,34 @@ def _reproduce(args: argparse.Namespace) -> int:
     return FAILED if done.failed else DONE
 
 
+def _audit(args: argparse.Namespace) -> int:
+    import tempfile
+
+    from bench import registry, spec
+    from bench.audit import report
+    from bench.audit.auditor import audit
+
+    with tempfile.TemporaryDirectory() as folder:
+        found = audit(spec.read(args.defense, registry.DEFENSE), args.words, args.trials, args.seed, Path(folder))
+    _print_rich(*report.report(found, args.defense))
+    return FAILED if found.verdict == "violated" else DONE
+
+
+def _budget(args: argparse.Namespace) -> int:
+    from bench import budget, records
+    from bench.public import Public
+    from leaderboard import tables
+
+    words = len(Public().dictionary("shipped")) if args.words is None else args.words
+    plan = budget.budget(args.image_epsilon, args.keypoints, args.releases, words)
+    _print_rich(*budget.report(plan))
+    if args.results is not None:
+        measured = budget.nearest(records.read(records.find(args.results)).records, plan.epsilon)
+        print(f"The nearest that was measured: ε = {float(measured[0]['privacy']['epsilon_descriptor']):g} for a descriptor")
+        _print_rich(*(tables.to_rich(table) for table in tables.tables(measured)))
+    return DONE
+
+
 def _check_attacks(task: Task, attacks: list[str] | None) -> None:
     if task.attacked and not attacks:
         raise UserError(f"--attack is missing: the task {task.name()} judges what an attack recovers (bench list attacks)")
@@ -372,6 +422,15 @@ def _whole(text: str) -> int:
         return int(text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"expected a whole number, not {text!r}") from None
+
+
+def _number(text: str) -> float:
+    from bench.exact import Exact
+
+    try:
+        return Exact(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected a number or a fraction, not {text!r}") from None
 
 
 def _wholes(text: str) -> tuple[int, ...]:

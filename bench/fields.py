@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
+from bench.exact import Exact
 from bench.plugin import Asset, Plugin
 
 
@@ -27,6 +27,12 @@ def without_default(plugin: type[Plugin]) -> list[str]:
     """The fields that must be given."""
     fields = dataclasses.fields(plugin)  # type: ignore[arg-type]
     return [field.name for field in fields if field.default is dataclasses.MISSING]
+
+
+def defaults(plugin: type[Plugin]) -> dict[str, Any]:
+    """Field name -> default, of the fields that have one."""
+    fields = dataclasses.fields(plugin)  # type: ignore[arg-type]
+    return {field.name: field.default for field in fields if field.default is not dataclasses.MISSING}
 
 
 def expected(kind: Any) -> str | None:
@@ -66,13 +72,6 @@ def _truth(text: str) -> bool:
     return bool(_choice(("false", "true"), text.lower()) == "true")
 
 
-def _number(text: str) -> float:
-    value = float(text)
-    if math.isnan(value):
-        raise ValueError(text)
-    return value
-
-
 def _named(kind: Callable[[str], Any]) -> Callable[[str], Any]:
     def read(text: str) -> Any:
         if not text:
@@ -85,7 +84,7 @@ def _named(kind: Callable[[str], Any]) -> Callable[[str], Any]:
 _EXPECTED = {
     bool: "true or false",
     int: "a whole number",
-    float: "a number (inf is one)",
+    float: "a number or a fraction (inf is one)",
     str: "text",
     Path: "a path",
     Asset: "'shipped' or the path of a file",
@@ -93,7 +92,7 @@ _EXPECTED = {
 _READ: dict[Any, Callable[[str], Any]] = {
     bool: _truth,
     int: int,
-    float: _number,
+    float: Exact,
     str: str,
     Path: _named(Path),
     Asset: _named(Asset),

@@ -59,7 +59,7 @@ class OneOf:
 class Privacy:
     """What a defense promises of one descriptor."""
 
-    guarantee: str  # "none", "epsilon-ldp", ...
+    guarantee: str  # "none", "epsilon-ldp", "epsilon-ldp-by-word" of a defense that remembers, ...
     epsilon: float | None = None  # nats, of one descriptor; None where nothing is promised
     log10_true: float | None = None  # log10 of the chance that the true word is in its set
 
@@ -95,6 +95,10 @@ class Defense(Plugin, ABC):
     @abstractmethod
     def privacy(self, public: Public) -> Privacy:
         """What is promised of one descriptor, and where it can be computed, the chance that it is told."""
+
+    def remembers(self) -> bool:
+        """Whether one device gives equal descriptors equal answers. `rng` then is the device: in the same state at each call."""
+        return False
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

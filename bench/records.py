@@ -76,6 +76,20 @@ def latest(records: Iterable[Record]) -> list[Record]:
     return list({(record["run_hash"], record["unit"]): record for record in records}.values())
 
 
+def find(path: str | Path) -> Path:
+    """The file of records that is meant: the file itself, or that of a folder which `bench run` wrote.
+
+    Raises
+    ------
+    UserError
+        if there is none.
+    """
+    file = Path(path) / FILE if Path(path).is_dir() else Path(path)
+    if not file.is_file():
+        raise UserError(f"{file}: no such file")
+    return file
+
+
 def load_records(path: str | Path) -> pd.DataFrame:
     """The latest records of a file, or of a folder that `bench run` wrote, one a row.
 
@@ -88,10 +102,7 @@ def load_records(path: str | Path) -> pd.DataFrame:
     """
     import pandas as pd
 
-    file = Path(path) / FILE if Path(path).is_dir() else Path(path)
-    if not file.is_file():
-        raise UserError(f"{file}: no such file")
-    contents = read(file)
+    contents = read(find(path))
     if contents.notice:
         logging.getLogger(__name__).warning(contents.notice)
     return pd.json_normalize([_with_infinity(record) for record in latest(contents.records)])

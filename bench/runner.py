@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from bench import environment, records, registry, spec
+from bench import composition, environment, records, registry, spec
 from bench.datasets import photographs
 from bench.datasets.photographs import Photograph, Source
 from bench.errors import PluginError, UnitError, UserError, blamed
@@ -321,8 +321,11 @@ def _observe(plan: Plan, source: Source) -> tuple[Photograph, Features]:
 
 
 def _protect(plan: Plan, cell: Cell, features: Features, content: str, *repetition: int) -> Release:
-    head = cell.head
-    rng = randomness("release", plan.seed, content, head["defense"], head["dataset"]["extractor"], *repetition)
+    made_with = cell.head["defense"], cell.head["dataset"]["extractor"]
+    if cell.defense.remembers():  # all photographs, and all their repetitions, come from one device
+        rng = randomness("device", plan.seed, *made_with)
+    else:
+        rng = randomness("release", plan.seed, content, *made_with, *repetition)
     with blamed(f"plugin {cell.defense.name()}"):
         release = cell.defense.protect(features, plan.public, rng)
         if not isinstance(release, cell.defense.releases):
@@ -381,22 +384,38 @@ def _record(
     keypoints: int | None = None,
     notes: Sequence[str] = (),
 ) -> Record:
-    epsilon = cell.privacy.epsilon
     return cell.head | {
         "unit": unit,
         "status": status,
         "reason": reason,
         "metrics": {} if outcome is None else {**outcome.metrics, "keypoints": keypoints},
-        "privacy": {
-            "guarantee": cell.privacy.guarantee,
-            "epsilon_descriptor": spec.finite(epsilon),
-            # The keypoints of one photograph compose.
-            "epsilon_image": None if epsilon is None or keypoints is None else spec.finite(keypoints * epsilon),
-            "log10_true": cell.privacy.log10_true,
-            "seeded": True,
-        },
+        "privacy": _privacy(cell, keypoints),
         "seconds": None,
         "notes": [*notes, *(outcome.notes if outcome else ())],
+    }
+
+
+def _privacy(cell: Cell, keypoints: int | None) -> dict[str, Any]:
+    """What the defense promises of what the attacker sees of one photograph, and what nothing covers."""
+    epsilon, remembers = cell.privacy.epsilon, cell.defense.remembers()
+    # A device that remembers answers once, however often it is asked.
+    releases = 1 if remembers or cell.attack is None else 1 + cell.attack.repeats()
+    spent: dict[str, float | str | None] = {"epsilon_image": None, "epsilon_image_optimal": None}
+    if epsilon is not None and keypoints is not None:
+        answers = keypoints * releases
+        spent["epsilon_image"] = spec.finite(composition.basic(epsilon, answers))
+        spent["epsilon_image_optimal"] = spec.finite(composition.optimal(epsilon, answers))
+    return {
+        "guarantee": cell.privacy.guarantee,
+        "epsilon_descriptor": spec.finite(epsilon),
+        "keypoints": keypoints,
+        "releases": releases,  # of the photograph
+        **spent,
+        "delta": composition.DELTA,  # of the optimal one
+        "uncovered": [*composition.UNCOVERED, *([composition.LINKS] if remembers else [])],
+        "log10_true": cell.privacy.log10_true,
+        "seeded": True,
+        "private": False,  # a seeded release is for measuring
     }
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from bench import fields, registry
 from bench.errors import UserError, unknown
+from bench.exact import Exact
 from bench.plugin import Plugin
 from bench.registry import Kind
 
@@ -91,8 +92,9 @@ def finite(value: float | None) -> float | str | None:
 
 
 def _plain(kind: Any, value: Any) -> Any:
-    if kind is float:
-        return finite(float(value))  # so that 10 and 10.0 are one configuration
+    if kind is float or isinstance(value, float):
+        text = str(Exact(value))
+        return text if "/" in text else finite(float(value))  # so that 10 and 10.0 are one configuration
     if isinstance(value, Path):
         return "sha256:" + hashlib.sha256(value.read_bytes()).hexdigest() if value.is_file() else value.as_posix()
     return value

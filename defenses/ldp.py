@@ -1,4 +1,9 @@
-"""LDP-Feat: the ω-subset mechanism on a dictionary of descriptors (Sec. 5.2, Steps 1 to 3; Eq. (5); Theorem 1)."""
+"""LDP-Feat: the ω-subset mechanism on a dictionary of descriptors (Sec. 5.2, Steps 1 to 3; Eq. (5); Theorem 1).
+
+With `memoize`, one answer is drawn for each word of the dictionary, and a device gives it whenever the word comes up. All that a
+device ever sends is then a function of its table of answers, so a word costs ε once, however often it is sent. In return equal
+words are seen to be equal, in one photograph and from one to the next, which no ε covers (docs/guarantee.md).
+"""
 
 from __future__ import annotations
 
@@ -38,6 +43,7 @@ class LDP(Defense):
     subset_size: int = 2  # words released per keypoint
     dictionary: Asset = Asset("shipped")
     words: int = 0  # how many of the dictionary's words are used at most, from its first on; 0 is all
+    memoize: bool = False  # whether a word always gets the same answer on one device
 
     def __post_init__(self) -> None:
         if not self.epsilon >= 0:  # NaN is refused too
@@ -50,15 +56,22 @@ class LDP(Defense):
     def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> WordSets:
         known = self._known(public)
         nearest = public.nearest_words(self.dictionary, secret, self.words)  # (N,) d'
-        words = word_subsets(nearest, len(known), self.epsilon, self.subset_size, rng)  # (N, m)
-        candidates = unit_rows(known.words[words])  # (N, m, D)
+        # A device that remembers draws its answers to all words, whichever it is asked for.
+        asked = np.arange(len(known)) if self.memoize else nearest
+        answers = word_subsets(asked, len(known), self.epsilon, self.subset_size, rng)
+        words = answers[nearest] if self.memoize else answers  # (N, m)
+        distinct, places = np.unique(words, return_inverse=True)
+        candidates = unit_rows(known.words[distinct])[places.reshape(words.shape)]  # (N, m, D)
         return WordSets(keypoints=secret.keypoints.copy(), size=secret.size, candidates=candidates, words=words)
 
     def privacy(self, public: Public) -> Privacy:
         log10_true = log10_chance(self.epsilon, len(self._known(public)), self.subset_size)
         if math.isinf(self.epsilon):
             return Privacy("none", log10_true=log10_true)
-        return Privacy("epsilon-ldp", self.epsilon, log10_true)
+        return Privacy("epsilon-ldp-by-word" if self.memoize else "epsilon-ldp", self.epsilon, log10_true)
+
+    def remembers(self) -> bool:
+        return self.memoize
 
     def _known(self, public: Public) -> Dictionary:
         """The dictionary, once it is known to hold enough words."""

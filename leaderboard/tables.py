@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 
 from bench import registry
+from bench.composition import DELTA, UNCOVERED
 from bench.listing import described
 from bench.records import Record, canonical, latest
 
@@ -23,9 +24,12 @@ NOT_APPLICABLE = "n/a"
 PAPER = ("mae", "mse", "ssim", "psnr")
 FIRST = ("keypoints", *PAPER)
 SEEDED = "Releases are seeded: they are for measuring, and not private."
-COMPOSED = "ε/image: the median; the keypoints of a photograph compose; their positions are released in the clear."
+COMPOSED = (
+    "ε/image: the median over photographs of what their keypoints spend together, by the smaller of basic composition and the "
+    f"optimal one at δ = {DELTA:g} (Kairouz, Oh and Viswanath). Not covered: {', '.join(UNCOVERED)}."
+)
 SHOWN_FAILURES = 10
-LEFT_TO_FILES = ("keypoints", "MSE", "angle", "l2")  # columns that a terminal has no room for
+LEFT_TO_FILES = ("MSE", "angle", "l2")  # columns that a terminal has no room for
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +174,7 @@ def _row(cell: list[Record], defense: str, attack: str, metrics: Sequence[str]) 
         "failed": None if cell[0]["status"] == "n/a" else len(cell) - len(done),
         **{name: _mean(record["metrics"].get(name) for record in done) for name in metrics},
         "epsilon_descriptor": _float(privacy["epsilon_descriptor"]),
-        "epsilon_image": _median(record["privacy"]["epsilon_image"] for record in done),
+        "epsilon_image": _median(_spent(record["privacy"]) for record in done),
         "log10_true": _float(privacy["log10_true"]),
         "note": "; ".join(_notes(cell)),
     }
@@ -181,8 +185,16 @@ def _notes(cell: list[Record]) -> list[str]:
     if cell[0]["status"] == "n/a":
         return [cell[0]["reason"]]
     done = [record for record in cell if record["status"] == "ok"]
+    uncovered = [part for part in cell[0]["privacy"].get("uncovered", ()) if part not in UNCOVERED]
     shared = [note for note in (done[0]["notes"] if done else []) if all(note in record["notes"] for record in done)]
-    return shared if done else ["no photograph could be done"]
+    beyond = [f"not covered either: {', '.join(uncovered)}"] if uncovered else []
+    return [*shared, *beyond] if done else ["no photograph could be done"]
+
+
+def _spent(privacy: dict[str, Any]) -> float | None:
+    """The smaller of what the two compositions say; older records have one alone."""
+    known = [float(privacy[name]) for name in ("epsilon_image", "epsilon_image_optimal") if privacy.get(name) is not None]
+    return min(known, default=None)
 
 
 def _metric_names(records: list[Record]) -> tuple[str, ...]:

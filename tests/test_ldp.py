@@ -8,6 +8,7 @@ from collections.abc import Callable
 from fractions import Fraction
 from itertools import combinations
 from pathlib import Path
+from time import process_time
 from typing import Any
 
 import numpy as np
@@ -16,10 +17,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
+from bench import protection
 from bench.errors import UserError
+from bench.exact import Exact, exact
 from bench.features import dictionary
 from bench.kernels.search import unit_rows
-from bench.kernels.subset import chance_digits, draw_distinct, draw_told, log10_chance, word_subsets
+from bench.kernels.subset import (
+    chance_digits,
+    draw_distinct,
+    draw_told,
+    information,
+    log10_chance,
+    most_accurate_size,
+    most_informative_size,
+    word_subsets,
+)
 from bench.plugin import Asset, Privacy
 from bench.public import Public
 from bench.types import Features
@@ -45,7 +57,7 @@ def exp_bounds(power: Fraction, terms: int) -> tuple[Fraction, Fraction]:
 
 def chance_bounds(epsilon: float, domain: int, size: int, terms: int = 160) -> tuple[Fraction, Fraction]:
     """Eq. (5) in rationals."""
-    bounds = exp_bounds(Fraction(repr(epsilon)), terms)
+    bounds = exp_bounds(exact(epsilon), terms)
     low, high = (size * power / (size * power + domain - size) for power in bounds)
     return low, high
 
@@ -100,6 +112,15 @@ def test_epsilon_is_the_decimal_that_it_is_written_as() -> None:
     digits = chance_digits(0.1, 6, 2, 128)
     assert math.floor(low * 2**128) == digits == math.floor(high * 2**128)
     assert digits != math.floor(binary[0] * 2**128)
+
+
+@pytest.mark.parametrize("text", ["1/3", "21/2", "22/7", "0.1000000000000000000000001"])
+def test_epsilon_may_be_a_fraction(text: str) -> None:
+    low, high = chance_bounds(Exact(text), 6, 2)
+    digits = chance_digits(Exact(text), 6, 2, 192)
+    assert math.floor(low * 2**192) == digits == math.floor(high * 2**192)
+    # The control: the nearest double is another number, unless it is that very one.
+    assert (digits == chance_digits(float(Exact(text)), 6, 2, 192)) == (text == "21/2")
 
 
 @pytest.mark.parametrize("epsilon", [100, 1000.0, 1e6, 1e17, 1.7e308])
@@ -195,7 +216,8 @@ def subsets_fit(sampler: Sampler, domain: int, size: int, epsilon: float, draws:
     return float(stats.chisquare(observed, expected).pvalue)
 
 
-CASES = [(6, 2, 0.0), (6, 2, 1.0), (6, 2, 3.0), (6, 3, 0.0), (6, 3, 1.0), (6, 3, 3.0), (6, 1, 1.0), (5, 4, 2.0)]
+# Some are drawn word by word (m² ≤ |K|), some without repetition.
+CASES = [(12, 3, 2.0), (6, 2, 0.0), (6, 2, 1.0), (6, 2, 3.0), (6, 3, 0.0), (6, 3, 1.0), (6, 3, 3.0), (6, 1, 1.0), (5, 4, 2.0)]
 
 
 @pytest.mark.parametrize(("domain", "size", "epsilon"), CASES)
@@ -357,6 +379,83 @@ def test_control_the_true_word_first_is_caught() -> None:
     assert order_fits(true_word_first) < CERTAINLY_WRONG
 
 
+# ---- how much a set tells
+
+
+@pytest.mark.parametrize(("domain", "size", "epsilon"), CASES)
+def test_information_against_enumeration(domain: int, size: int, epsilon: float) -> None:
+    law = np.array(list(enumerated(epsilon, domain, size).values()))  # (sets, words)
+    marginal = law.mean(axis=1, keepdims=True)
+    expected = (law / domain * np.log(law / marginal)).sum()
+    assert information(epsilon, domain, np.array([size]))[0] == pytest.approx(expected, rel=1e-12, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("domain", "epsilon"), [(256_000, 10.0), (256_000, 8.0), (262_144, 12.0), (1000, 0.1), (64, 2.0), (50, 300.0)]
+)
+def test_the_most_informative_size(domain: int, epsilon: float) -> None:
+    best = most_informative_size(epsilon, domain)
+    chance_true = [chance(epsilon, domain, m) for m in range(1, domain)] if epsilon < 30 else None
+    if chance_true is not None:  # by another route: I = H(Z) − H(Z | v) with logarithms of binomials left out
+        told = np.array(chance_true)
+        m = np.arange(1, domain)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            tells = told * np.log(told / m * domain) + (1 - told) * np.log((1 - told) / (1 - m / domain))
+        assert best == 1 + int(np.nanargmax(tells))
+    e = math.exp(epsilon)
+    assert abs(best - max(1, domain * ((epsilon - 1) * e + 1) / (e - 1) ** 2)) <= 1
+
+
+def test_the_two_optima_at_full_size() -> None:
+    """|K| / (e^ε + 1) is not where mutual information is greatest: that is at nine times as many words."""
+    assert most_accurate_size(10.0, 256_000) == most_accurate_size(10.0, 262_144) == 12
+    assert most_informative_size(10.0, 256_000) == 105
+    tells = information(10.0, 256_000, np.array([2, 12, 105]))
+    assert tells[2] > 1.5 * tells[1] > 4 * tells[0]
+    assert most_informative_size(0.01, 1000) == pytest.approx(500, abs=3) == most_accurate_size(0.01, 1000)
+    assert most_informative_size(math.inf, 1000) == 1
+
+
+def test_the_accurate_size_has_the_least_variance() -> None:
+    """Of the unbiased estimate of a rare word's frequency: q (1 − q) / (p − q)², q the rate of a word that is not true."""
+
+    def variance(epsilon: float, domain: int, size: int) -> float:
+        p = chance(epsilon, domain, size)
+        q = (size - p) / (domain - 1)
+        return q * (1 - q) / (p - q) ** 2
+
+    for epsilon, domain in ((10.0, 256_000), (3.0, 1000), (0.5, 100)):
+        least = min(range(1, 500 if domain > 500 else domain), key=lambda m: variance(epsilon, domain, m))
+        assert abs(most_accurate_size(epsilon, domain) - least) <= 1
+
+
+# ---- an independent implementation
+
+
+def test_inclusion_rates_against_multi_freq_ldpy() -> None:
+    """As sets; its order tells, which `test_audit.py` finds."""
+    from multi_freq_ldpy.pure_frequency_oracles.SS import SS_Client
+
+    domain, epsilon, true, rows = 64, 2.0, 20, 30_000
+    size = most_accurate_size(epsilon, domain)
+    np.random.seed(1)  # noqa: NPY002  # what it draws from
+    sets = np.stack([SS_Client.py_func(true, domain, epsilon) for _ in range(rows)])
+    assert sets.shape == (rows, size)
+    theirs = np.bincount(sets.ravel(), minlength=domain)
+    rng = np.random.default_rng(2)
+
+    def agree(ours: np.ndarray) -> float:
+        """The lesser p-value of: the true word is told as often; the others are told alike."""
+        mine = np.bincount(ours.ravel(), minlength=domain)
+        told = stats.chi2_contingency([[mine[true], rows - mine[true]], [theirs[true], rows - theirs[true]]], correction=False)
+        others = stats.chi2_contingency([np.delete(mine, true), np.delete(theirs, true)])
+        return min(told.pvalue, others.pvalue)
+
+    assert agree(word_subsets(np.full(rows, true), domain, epsilon, size, rng)) > ALPHA
+    assert agree(word_subsets(np.full(rows, true), domain, epsilon + 0.1, size, rng)) < ALPHA  # the controls
+    assert agree(np.minimum(word_subsets(np.full(rows, true), domain, epsilon, size, rng), domain - 2)) < ALPHA
+
+
 # ---- the plugin
 
 
@@ -503,3 +602,86 @@ def test_an_attacker_is_trained_for_what_is_served() -> None:
     assert 12.0 in LDP.serves["epsilon"]
     assert math.inf not in LDP.serves["epsilon"]
     assert 5 not in LDP.serves["subset_size"]
+
+
+# ---- memory
+
+
+def repeating_features(count: int) -> Features:
+    """Each of `count` descriptors twice."""
+    return make_features(count).take(np.repeat(np.arange(count), 2))
+
+
+def test_equal_words_get_equal_answers_only_where_that_is_asked(tmp_path: Path) -> None:
+    asset, secret = make_dictionary(tmp_path, 300), repeating_features(60)
+    remembered = LDP(dictionary=asset, memoize=True).protect(secret, Public(), np.random.default_rng(0)).words
+    assert remembered is not None
+    np.testing.assert_array_equal(remembered[::2], remembered[1::2])
+    forgotten = LDP(dictionary=asset).protect(secret, Public(), np.random.default_rng(0)).words
+    assert forgotten is not None
+    assert (forgotten[::2] != forgotten[1::2]).any(axis=1).sum() > 40
+
+
+def test_what_is_remembered_has_the_law_of_the_mechanism(tmp_path: Path) -> None:
+    """Over devices, not over keypoints."""
+    asset, public = make_dictionary(tmp_path, 6), Public()
+    one, defense = make_features(1), LDP(dictionary=asset, epsilon=1.0, memoize=True)
+    nearest = int(nearest_by_hand(one, public.dictionary(asset).words)[0])
+    draws = 4000
+    releases = [defense.protect(one, public, np.random.default_rng(device)).words for device in range(draws)]
+    found = [tuple(words[0].tolist()) for words in releases if words is not None]
+    law = enumerated(1.0, 6, 2)
+    observed, expected = [found.count(Z) for Z in law], [draws * by_word[nearest] for by_word in law.values()]
+    assert stats.chisquare(observed, expected).pvalue > ALPHA
+    wrong = [draws * by_word[(nearest + 1) % 6] for by_word in law.values()]
+    assert stats.chisquare(observed, wrong).pvalue < ALPHA  # the control
+
+
+def test_a_defense_that_remembers_promises_something_else(tmp_path: Path) -> None:
+    asset = make_dictionary(tmp_path, 300)
+    remembering, forgetful = (LDP(dictionary=asset, memoize=memoize) for memoize in (True, False))
+    assert (remembering.remembers(), forgetful.remembers()) == (True, False)
+    assert remembering.privacy(Public()).guarantee == "epsilon-ldp-by-word"
+    assert forgetful.privacy(Public()).guarantee == "epsilon-ldp"
+
+
+# ---- speed
+
+
+ROWS = 100_000
+SPEEDS = [(2, 64, "seeded"), (2, 256_000, "seeded"), (2, 2**30, "seeded"), (12, 256_000, "seeded"), (2, 256_000, "cipher")]
+
+
+def works(size: int, domain: int, generator: str) -> dict[str, Callable[[], object]]:
+    """Sampling, and its floor: m + 1 random 64-bit words a descriptor."""
+    rng = protection.generator(bytes(32)) if generator == "cipher" else np.random.default_rng(0)
+    true = np.random.default_rng(1).integers(domain, size=ROWS)
+    return {
+        "sets": lambda: word_subsets(true, domain, 10.0, size, rng),
+        "random words": lambda: rng.integers(2**64 - 1, size=(ROWS, size + 1), dtype=np.uint64, endpoint=True),
+    }
+
+
+@pytest.mark.benchmark
+@pytest.mark.parametrize("work", ["random words", "sets"])
+@pytest.mark.parametrize(("size", "domain", "generator"), SPEEDS, ids=short)
+def test_speed_of_sampling(benchmark: Any, size: int, domain: int, generator: str, work: str) -> None:
+    benchmark.group = f"m = {size}, |K| = {short(domain)}, {generator}"
+    benchmark(works(size, domain, generator)[work])
+
+
+@pytest.mark.benchmark
+@pytest.mark.parametrize(("size", "domain", "generator"), SPEEDS, ids=short)
+def test_sampling_takes_at_most_five_times_its_floor(benchmark: Any, size: int, domain: int, generator: str) -> None:
+    """In turn, and in time on the processor, so that what else runs on it counts little."""
+    seconds: dict[str, list[float]] = {}
+
+    def both() -> None:
+        for name, work in works(size, domain, generator).items():
+            started = process_time()
+            work()
+            seconds.setdefault(name, []).append(process_time() - started)
+
+    benchmark.group = "both"
+    benchmark.pedantic(both, rounds=15)
+    assert min(seconds["sets"]) <= 5 * min(seconds["random words"])

@@ -16,13 +16,14 @@ from fake_plugins.painter import Painter
 from fakes import FAKES, album, install
 from PIL import Image
 
-from bench import runner
+from attacks.repeat import Repeat
+from bench import composition, runner
 from bench.errors import UserError
 from bench.plugin import Asset, Attack, Defense, Task, View
 from bench.records import FILE, Record
 from bench.tasks.reconstruction import Reconstruction
 from bench.testing import small_dictionary
-from bench.types import Descriptors, Knowledge
+from bench.types import Knowledge
 from defenses.affine import Affine
 from defenses.ldp import LDP
 from defenses.none import Undefended
@@ -71,9 +72,18 @@ def test_record_has_what_the_schema_says(images: Path, small: Asset) -> None:
     assert count > 0
     assert first["metrics"]["angle"] is None  # the attack recovered no descriptors
     assert 0 < first["metrics"]["mae"] < 1
-    assert first["privacy"]["epsilon_image"] == count * 8.0
-    assert first["privacy"]["seeded"] is True
-    assert first["privacy"]["log10_true"] < 0
+    privacy = first["privacy"]
+    assert (privacy["guarantee"], privacy["epsilon_descriptor"], privacy["keypoints"], privacy["releases"]) == (
+        "epsilon-ldp",
+        8.0,
+        count,
+        1,
+    )
+    assert privacy["epsilon_image"] == count * 8.0
+    assert privacy["epsilon_image_optimal"] == composition.optimal(8.0, count, privacy["delta"]) < count * 8.0
+    assert privacy["uncovered"] == ["the keypoints' positions", "the number of keypoints"]
+    assert (privacy["seeded"], privacy["private"]) == (True, False)
+    assert privacy["log10_true"] < 0
     assert first["seconds"] > 0
     assert first["environment"]["source"].startswith("sha256:")
     json.dumps(first, allow_nan=False)
@@ -179,6 +189,7 @@ def test_bad_photograph_is_a_failed_record_and_the_others_are_done(images: Path,
     assert "cannot be read as an image" in records[2]["reason"]
     assert "no keypoint" in records[6]["reason"]
     assert records[2]["privacy"]["epsilon_image"] is None
+    assert records[2]["privacy"]["epsilon_image_optimal"] is None
 
 
 def test_broken_plugin_fails_its_own_cells_and_leaves_a_traceback(images: Path, tmp_path: Path) -> None:
@@ -305,15 +316,43 @@ def test_damaged_records_stop_the_run_before_it_starts(images: Path, tmp_path: P
     assert file.read_bytes() == b"nonsense\n{}\n"
 
 
-# ---- protecting for real
+# ---- one device, several releases
 
 
-def test_protect_draws_from_the_operating_system(small: Asset) -> None:
-    import bench
-    from bench.testing import example_features, same
+def test_releases_add_up_and_a_device_that_remembers_repeats_itself(images: Path, small: Asset) -> None:
+    """At ε = 5 a set of 512 words holds the true one with a chance of .37; of 12 sets of a keypoint, it is in most."""
 
-    features, defense = example_features(), LDP(dictionary=small)
-    assert not same(bench.protect(features, defense), bench.protect(features, defense))
-    seeded = [bench.protect(features, defense, np.random.default_rng(0)) for _ in range(2)]
-    assert same(*seeded)
-    assert isinstance(bench.protect(features, Undefended()), Descriptors)
+    def of(memoize: bool, releases: int) -> tuple[float, dict[str, Any]]:
+        defense = LDP(epsilon=5, dictionary=small, memoize=memoize)
+        found = run([defense], [Repeat(releases=releases)], images)
+        return float(np.mean([record["metrics"]["l2"] for record in found])), found[0]["privacy"]
+
+    once, spent_once = of(memoize=False, releases=1)
+    often, spent_often = of(memoize=False, releases=12)
+    assert often < once - 0.1  # the attack gains by repetition
+    assert (spent_once["releases"], spent_often["releases"]) == (1, 12)
+    assert spent_often["epsilon_image"] == 12 * spent_once["epsilon_image"]
+    remembered, spent = of(memoize=True, releases=12)
+    assert remembered > often + 0.1  # and by nothing that is repeated word for word
+    assert (spent["guarantee"], spent["releases"]) == ("epsilon-ldp-by-word", 1)
+    assert spent["epsilon_image"] == spent_once["epsilon_image"]
+    assert spent["uncovered"][-1] == "which keypoints share a word"
+
+
+def test_a_device_that_remembers_gives_one_answer_in_all_photographs(images: Path, small: Asset) -> None:
+    """The runner hands all photographs' features to one device."""
+    seen: dict[int, set[tuple[int, ...]]] = {}
+
+    class Watching(LDP):
+        def protect(self, secret: Any, public: Any, rng: np.random.Generator) -> Any:
+            release = super().protect(secret, public, rng)
+            for word, answer in zip(public.nearest_words(small, secret).tolist(), release.words.tolist(), strict=True):
+                seen.setdefault(word, set()).add(tuple(answer))
+            return release
+
+    run([Watching(dictionary=small, memoize=True)], [Painter()], images)
+    assert len(seen) > 20
+    assert all(len(answers) == 1 for answers in seen.values())
+    seen.clear()
+    run([Watching(dictionary=small)], [Painter()], images)
+    assert any(len(answers) > 1 for answers in seen.values())  # the control

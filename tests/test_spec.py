@@ -40,7 +40,10 @@ def test_infinity_truth_choices_and_paths() -> None:
     ("text", "complaint"),
     [
         ("lpd", "did you mean 'ldp'"),
-        ("ldp:epsilom=1", r"unknown field of ldp 'epsilom'; did you mean 'epsilon'\? There is dictionary, epsilon, subset_size"),
+        (
+            "ldp:epsilom=1",
+            r"unknown field of ldp 'epsilom'; did you mean 'epsilon'\? There is dictionary, epsilon, memoize, subset_size",
+        ),
         ("ldp:epsilon=much", "epsilon must be a number"),
         ("ldp:epsilon=nan", "epsilon must be a number"),
         ("ldp:epsilon=", "epsilon must be a number"),
@@ -79,6 +82,7 @@ def test_configuration_holds_the_content_of_files(tmp_path: Path) -> None:
         "subset_size": 2,
         "dictionary": public.dictionary(small).digest,
         "words": 0,
+        "memoize": False,
     }
     renamed = Asset(Path(small).rename(tmp_path / "renamed.safetensors"))
     assert spec.configuration(LDP(dictionary=renamed), public) == spec.configuration(LDP(epsilon=10, dictionary=small), public)
@@ -88,6 +92,13 @@ def test_configuration_knows_no_infinity_and_one_way_of_writing_a_number(tmp_pat
     small = small_dictionary(tmp_path)
     assert spec.configuration(LDP(epsilon=math.inf, dictionary=small), Public())["epsilon"] == "inf"
     assert repr(spec.written(LDP(epsilon=10))["epsilon"]) == "10.0"
+
+
+@pytest.mark.parametrize(("text", "written"), [("21/2", 10.5), ("0.1", 0.1), ("1/3", "1/3"), ("10", 10.0), ("inf", "inf")])
+def test_a_fraction_is_kept(text: str, written: float | str) -> None:
+    """And written so that two configurations which differ are two in the records, too."""
+    assert spec.written(spec.read(f"ldp:epsilon={text}", registry.DEFENSE))["epsilon"] == written
+    assert spec.written(spec.read("ldp:epsilon=0.3333333333333333", registry.DEFENSE))["epsilon"] != "1/3"
 
 
 def test_what_is_resolved_elsewhere_stands_in_the_place_of_an_asset() -> None:

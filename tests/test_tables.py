@@ -49,6 +49,28 @@ def test_metrics_are_averaged_over_photographs() -> None:
     assert table.metrics == ("keypoints", "mae", "ssim", "psnr")  # nothing has an angle
 
 
+def test_the_smaller_of_two_compositions_is_shown() -> None:
+    optimal = record("b", privacy=record()["privacy"] | {"epsilon_image": 3000.0, "epsilon_image_optimal": 2500.0})
+    (table,) = tables.tables([optimal])
+    assert table.frame.iloc[0]["epsilon_image"] == 2500.0
+    shown = tables.to_markdown(table)
+    assert "2500" in shown
+    assert "δ = 1e-06" in shown
+    assert "Not covered: the keypoints' positions, the number of keypoints." in shown
+
+
+def test_what_is_not_covered_beyond_that_is_noted() -> None:
+    linked = record()["privacy"] | {"uncovered": ["the keypoints' positions", "which keypoints share a word"]}
+    (table,) = tables.tables([record(privacy=linked)])
+    assert table.frame.iloc[0]["note"] == "not covered either: which keypoints share a word"
+    assert tables.tables([record()])[0].frame.iloc[0]["note"] == ""
+
+
+def test_a_terminal_shows_how_many_keypoints_there_are() -> None:
+    drawn = tables.to_rich(tables.tables([record()])[0])
+    assert "keypoints" in [str(column.header) for column in drawn.columns]
+
+
 def test_heading_states_what_was_measured() -> None:
     (table,) = tables.tables([record()])
     assert table.heading == "Reconstruction on photos (1 photograph), sift upright features, seed 0"

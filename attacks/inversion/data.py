@@ -18,6 +18,7 @@ from bench.datasets.photographs import SIDE
 from bench.errors import UserError
 from bench.features.dictionary import Dictionary
 from bench.features.views import PhotographView
+from bench.kernels.rows import row_keys
 from bench.kernels.search import unit_rows
 from bench.plugin import Asset, Between, Defense, OneOf
 from bench.progress import Progress
@@ -112,14 +113,6 @@ class Quantisation:
         if not np.array_equal(keys[np.minimum(places, len(keys) - 1)], wanted):
             raise KeyError("a row that is not in the training set")
         return words[places]
-
-
-def row_keys(rows: Bytes | Floats) -> np.ndarray:
-    """A 64-bit key of each row, the same wherever it stands; among 10 million rows two agree with chance 3e-6. -> (N,) uint64"""
-    lanes = np.ascontiguousarray(rows).view(np.uint64)  # (N, D itemsize / 8)
-    factors = 2 * np.random.default_rng(0).integers(2**63, size=lanes.shape[1:], dtype=np.uint64) + 1  # odd
-    mixed = lanes * factors  # wraps around
-    return ((mixed ^ (mixed >> np.uint64(29))) * factors[::-1]).sum(axis=1, dtype=np.uint64)
 
 
 def quantise(

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from attacks.inversion.network import Inverter, Shape
-from bench import spec, tensorfile
+from bench import fields, spec, tensorfile
 from bench.device import pick_device
 from bench.errors import UserError
 from bench.plugin import Between, Defense, Extractor, OneOf
@@ -118,9 +118,10 @@ def misfit(meta: dict[str, Any], defense: Defense, extractor: Extractor, public:
     for field, text in meta["serves"].items():
         if getattr(defense, field) not in _setting(text):
             return f"trained for {field} {_setting(text)}, not {getattr(defense, field)}"
+    trained = fields.defaults(type(defense)) | meta["defense"]  # a field that is newer than the network had its default
     for field in sorted((have.keys() | meta["defense"].keys()) - meta["serves"].keys()):
-        if have.get(field) != meta["defense"].get(field):
-            return f"trained for {field} {meta['defense'].get(field)}, not {have.get(field)}"
+        if have.get(field) != trained.get(field):
+            return f"trained for {field} {trained.get(field)}, not {have.get(field)}"
     return other_features(meta, extractor, public)
 
 

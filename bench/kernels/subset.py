@@ -12,22 +12,26 @@ draw m − u elements without replacement from K − {v}, and add v if u = 1. Th
 which sums to 1 over all Z, and Pr(Z | v1) ≤ e^ε Pr(Z | v2) for all Z, v1, v2: the mechanism is ε-LDP. (The paper's Definition 2
 prints m in place of the first |K|, and then sums to m / |K|; its Eq. (5) and the ratio are right.)
 
-A set has no order, so rows come out sorted. ε means the decimal number that `repr` prints: 0.1 is one tenth.
+A set has no order, so rows come out sorted. ε is the decimal or the fraction that it was written as (`bench.exact`): 0.1 is one
+tenth.
 """
 
 from __future__ import annotations
 
 import math
-from decimal import MAX_EMAX, MIN_EMIN, ROUND_HALF_EVEN, Context, Decimal
+from decimal import MAX_EMAX, MIN_EMIN, ROUND_CEILING, ROUND_FLOOR, ROUND_HALF_EVEN, Context, Decimal
 from fractions import Fraction
+from functools import cache
 from itertools import count
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.exact import exact
 from bench.types import Bytes, Indices
 
 WIDTH = 64  # bits of p that are compared in one step
+STEP = 2**15  # words that are drawn at a time: they stay in the cache
 
 
 def chance_digits(epsilon: float, domain: int, size: int, bits: int) -> int:
@@ -36,12 +40,14 @@ def chance_digits(epsilon: float, domain: int, size: int, bits: int) -> int:
     p is 1 for ε = ∞ and for |K| = m. For any other ε but 0, e^ε is transcendental (Lindemann), so p lies on no multiple
     of 2^-bits, and a finite precision tells on which side it is.
     """
+    return 1 << bits if _is_certain(epsilon, domain, size) else _digits(exact(epsilon), domain, size, bits)
+
+
+@cache
+def _digits(power: Fraction, domain: int, size: int, bits: int) -> int:
     rest = domain - size
-    if _is_certain(epsilon, domain, size):
-        return 1 << bits
-    if epsilon == 0:
+    if power == 0:
         return (size << bits) // domain
-    power = Decimal(repr(float(epsilon)))
     if power >= bits + rest.bit_length():
         return (1 << bits) - 1  # as 1 − p < rest · e^-ε < 2^-bits; and e^ε need not be a number that fits anywhere
     precision = bits // 3 + 30  # decimal digits, more than `bits` binary ones
@@ -57,8 +63,19 @@ def _is_certain(epsilon: float, domain: int, size: int) -> bool:
     return domain == size or math.isinf(epsilon)
 
 
-def _enclose_chance(power: Decimal, rest: int, size: int, precision: int) -> tuple[Fraction, Fraction]:
-    """Bounds of p from `precision` decimal digits.
+def _enclose_chance(power: Fraction, rest: int, size: int, precision: int) -> tuple[Fraction, Fraction]:
+    """Bounds of p from `precision` decimal digits: from ε rounded down, and from ε rounded up."""
+    low, high = (
+        Context(prec=precision, rounding=rounding, Emax=MAX_EMAX, Emin=MIN_EMIN).divide(
+            Decimal(power.numerator), Decimal(power.denominator)
+        )
+        for rounding in (ROUND_FLOOR, ROUND_CEILING)
+    )
+    return _chance_about(low, rest, size, precision)[0], _chance_about(high, rest, size, precision)[1]
+
+
+def _chance_about(power: Decimal, rest: int, size: int, precision: int) -> tuple[Fraction, Fraction]:
+    """Bounds of p at a decimal ε.
 
     Each operation of `decimal`, exp among them, is correctly rounded, and so errs by a factor within 1 ± 5 · 10^-precision.
     The numerator has two such factors, the denominator three and the quotient one: below 1 ± 4 · 10^(1 - precision).
@@ -76,6 +93,35 @@ def log10_chance(epsilon: float, domain: int, size: int) -> float:
         return 0.0
     odds_against = math.log(domain - size) - math.log(size) - epsilon  # ln((1 − p) / p); math.log takes integers of any size
     return -float(np.logaddexp(0.0, odds_against)) / math.log(10)
+
+
+def information(epsilon: float, domain: int, sizes: Indices) -> NDArray[np.float64]:
+    """What a released set tells of a uniform true word, for each size m: their mutual information in nats. (S,) -> (S,)
+
+    I = p ε + ln(|K| / (m e^ε + |K| − m)), as a set holds the true word with probability p and all sets are equally likely.
+    """
+    m = sizes.astype(np.float64)
+    with np.errstate(divide="ignore"):
+        total = np.logaddexp(np.log(m) + epsilon, np.log(domain - m))
+    return np.exp(np.log(m) + epsilon - total) * epsilon + math.log(domain) - total
+
+
+def most_informative_size(epsilon: float, domain: int) -> int:
+    """The size m < |K| at which a set tells most of the true word.
+
+    It is about |K| (ε e^ε − e^ε + 1) / (e^ε − 1)², where I has no slope (Wang et al., arXiv:1607.08025).
+    """
+    sizes = np.arange(1, domain)
+    return 1 if math.isinf(epsilon) else int(sizes[information(epsilon, domain, sizes).argmax()])
+
+
+def most_accurate_size(epsilon: float, domain: int) -> int:
+    """The size at which sets of many people tell the frequencies of words best: |K| / (e^ε + 1) (Ye and Barg, arXiv:1702.00610).
+
+    A set then holds the true word with a chance of about one half. Both sizes tend to |K| / 2 for small ε, and part for large.
+    """
+    share = math.exp(-epsilon) / (1 + math.exp(-epsilon))
+    return min(domain - 1, max(1, round(domain * share)))
 
 
 def draw_told(rows: int, epsilon: float, domain: int, size: int, rng: np.random.Generator) -> NDArray[np.bool_]:
@@ -115,8 +161,54 @@ def draw_distinct(rows: int, domain: int, size: int, rng: np.random.Generator) -
 
 
 def word_subsets(true: Indices, domain: int, epsilon: float, size: int, rng: np.random.Generator) -> Indices:
-    """The ω-subset mechanism on K = {0, ..., domain − 1}. true: (N,) -> (N, m), rows ascending"""
+    """The ω-subset mechanism on K = {0, ..., domain − 1}. true: (N,) -> (N, m), rows ascending
+
+    Where repetitions are rare, words are drawn one by one, and only sets with a repetition anew and without. A set is accepted
+    whichever its words are, so both kinds have the law of the theorem, and what this costs does not depend on |K|.
+    """
     told = draw_told(len(true), epsilon, domain, size, rng)
+    if size * size > domain or domain == 1:
+        return _without_repetition(true, told, domain, size, rng)
+    words = _one_by_one(true, told, domain, size, rng)
+    again = _repeating(words)
+    words[again] = _without_repetition(true[again], told[again], domain, size, rng)
+    return words
+
+
+def _one_by_one(true: Indices, told: NDArray[np.bool_], domain: int, size: int, rng: np.random.Generator) -> Indices:
+    """Words other than v, and v in the place of the first where u = 1. (N,), (N,) -> (N, m), rows ascending"""
+    words = np.empty((len(true), size), dtype=np.int64)
+    for start in range(0, len(true), STEP // size):
+        rows = slice(start, start + STEP // size)
+        drawn = rng.integers(domain - 1, size=(size, len(true[rows])))  # (m, n) of the |K| − 1 that remain
+        drawn += drawn >= true[rows]
+        np.copyto(drawn[0], true[rows], where=told[rows])
+        words[rows] = _ascending(drawn)
+    return words
+
+
+def _ascending(columns: Indices) -> Indices:
+    """The sorted rows of a matrix that is given by its columns. (m, n) -> (n, m)"""
+    if len(columns) > 4:
+        rows = columns.T.copy()
+        rows.sort(axis=1)
+        return rows
+    for last in range(len(columns) - 1, 0, -1):  # bubble sort: to sort rows so short one by one takes up to ten times as long
+        for place in range(last):
+            low, high = columns[place], columns[place + 1]
+            columns[place], columns[place + 1] = np.minimum(low, high), np.maximum(low, high)
+    return columns.T
+
+
+def _repeating(rows: Indices) -> Indices:
+    """The numbers of those ascending rows in which a word stands twice. (n, m) -> (r,)"""
+    flat, length = rows.ravel(), rows.shape[1]
+    equal = np.flatnonzero(flat[1:] == flat[:-1])
+    return np.unique(equal[equal % length < length - 1] // length)  # not from the end of a row to the next
+
+
+def _without_repetition(true: Indices, told: NDArray[np.bool_], domain: int, size: int, rng: np.random.Generator) -> Indices:
+    """The sets of the mechanism once u is drawn, for any m up to |K|. (N,), (N,) -> (N, m), rows ascending"""
     words = np.empty((len(true), size), dtype=np.int64)
     for u in (0, 1):
         rows = np.flatnonzero(told == u)

@@ -1,0 +1,29 @@
+"""A defense that claims an ε that it does not keep."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bench.plugin import Asset, Defense, Privacy
+from bench.public import Public
+from bench.types import Descriptors, Features
+
+
+@dataclass(frozen=True, kw_only=True)
+class Overclaiming(Defense):
+    """Releases the nearest word."""
+
+    releases = Descriptors
+
+    dictionary: Asset = Asset("shipped")
+
+    def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> Descriptors:
+        words = public.dictionary(self.dictionary).words[public.nearest_words(self.dictionary, secret)].astype(np.float32)
+        words /= np.linalg.norm(words, axis=1, keepdims=True)
+        return Descriptors(keypoints=secret.keypoints.copy(), size=secret.size, descriptors=words)
+
+    def privacy(self, public: Public) -> Privacy:
+        return Privacy("epsilon-ldp", 2.0)
+
+
+PLUGIN = Overclaiming

@@ -1,0 +1,62 @@
+"""Numbers that are kept as they were written."""
+
+import math
+import pickle
+from decimal import Decimal
+from fractions import Fraction
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bench.exact import Exact, exact
+
+
+@pytest.mark.parametrize(
+    ("text", "fraction", "written"),
+    [
+        ("0.1", Fraction(1, 10), "0.1"),
+        ("21/2", Fraction(21, 2), "10.5"),
+        ("1/3", Fraction(1, 3), "1/3"),
+        ("1e-3", Fraction(1, 1000), "0.001"),
+        ("0.1000000000000000000001", Fraction(10**21 + 1, 10**22), str(Fraction(10**21 + 1, 10**22))),
+        (" -2 ", Fraction(-2), "-2.0"),
+    ],
+)
+def test_text_is_kept_exactly(text: str, fraction: Fraction, written: str) -> None:
+    number = Exact(text)
+    assert number.fraction == fraction == exact(number)
+    assert number == float(fraction)
+    assert str(number) == repr(number) == written
+    assert Exact(written).fraction == fraction
+
+
+@given(st.fractions() | st.decimals(allow_nan=False, allow_infinity=False, min_value=-(10**9), max_value=10**9))
+def test_fractions_and_decimals_are_kept(value: Fraction | Decimal) -> None:
+    assert exact(Exact(value)) == Fraction(value)
+    assert exact(Exact(str(Exact(value)))) == Fraction(value)
+
+
+def test_a_float_is_the_decimal_that_it_prints() -> None:
+    assert exact(0.1) == Fraction(1, 10) != Fraction(0.1)
+    assert exact(Exact(0.1)) == Fraction(1, 10)
+    assert exact(3) == 3
+
+
+def test_infinity() -> None:
+    for text in ("inf", "Infinity", "-inf", math.inf):
+        assert math.isinf(Exact(text))
+        assert Exact(text).fraction is None
+    assert str(Exact("inf")) == "inf"
+    with pytest.raises(OverflowError):
+        exact(Exact("inf"))
+
+
+@pytest.mark.parametrize("text", ["", "nan", "much", "1/0", "1e400", "1/2/3"])
+def test_no_number(text: str) -> None:
+    with pytest.raises(ValueError, match=r"."):
+        Exact(text)
+
+
+def test_a_copy_is_as_exact() -> None:
+    assert exact(pickle.loads(pickle.dumps(Exact("1/3")))) == Fraction(1, 3)
