@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from bench.device import pick_device
+from bench.kernels.search import unit_rows
 from bench.types import Floats, Indices, Subspaces
 
 BLOCK = 2048  # words at a time, so that a block's products stay near the processor
@@ -39,6 +40,17 @@ def nearest_to_subspaces(release: Subspaces, words: Floats) -> tuple[Indices, Fl
     if not found:
         return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.float32)
     return torch.cat(found).numpy(), torch.cat(distances).float().numpy()
+
+
+def feet(release: Subspaces) -> Floats:
+    """For each subspace the direction of its point nearest to zero, negative components cut: what one guesses of a descriptor
+    that is nowhere negative and of unit norm, if D is all one knows. -> (N, D) unit norm
+    """
+    origins, bases = release.origins.astype(np.float64), release.bases.astype(np.float64)
+    points = origins - np.einsum("nmd,nm->nd", bases, np.einsum("nmd,nd->nm", bases, origins))
+    cut = np.maximum(points, 0.0)
+    cut[~cut.any(axis=1)] = 1.0
+    return unit_rows(cut)
 
 
 def _shortlist(points: Tensor, frames: Tensor, rows: Tensor) -> Tensor:
