@@ -1,14 +1,15 @@
-"""Sparsity, an attack that is in no paper: it needs no knowledge but that descriptors are non-negative with many exact zeros.
+"""Sparsity, an attack that is in no paper: it knows nothing but that descriptors are non-negative with many exact zeros.
 
-The points of D that are nowhere negative make a polytope. A vertex of it is where dim components vanish; SIFT has a median of about
-20 zeros in 128, so that the secret is a *degenerate* vertex, where more than dim do. Chance makes no such vertex of unit norm: one
-that is found is the secret, or a word of the database that is as sparse (`candidates.py` says which is taken). A walk over vertices
-by linear programming finds them (`vertices.py`).
+The points of D that are nowhere negative are a polytope, and a vertex of it is where dim components vanish. SIFT has a median
+of about 20 zeros in 128, so that the secret is a *degenerate* vertex, where more vanish. Chance makes no such vertex of unit
+norm: one that is found is the secret, or a word of the database that is as sparse (`bench/kernels/candidates.py` says which
+is taken). A walk over vertices by linear programming finds them (`bench/kernels/vertices.py`).
 
-Where it fails: at descriptors of dim zeros or fewer, which are no degenerate vertex; at those of few more, whose share of the
-objectives that lead to them is small; and where the database has raw descriptors, of which each is as good a vertex. There the
-estimate is another descriptor, or, where no vertex was found, the direction of the point of D nearest to zero, which is nearer to the
-secret than any vertex short of it. No more than the 8-bit grid is given up by using zeros alone: `lattice` uses the grid.
+Where it fails: at descriptors of dim zeros or fewer, which are no degenerate vertex; at those of few more, for few objectives
+lead to them; and where words of the database are sparse as well, above all if they are raw descriptors. Where no vertex was
+found, the estimate is the direction of D's point nearest to zero; the best vertex short of the secret is farther from it (a
+mean cosine of 0.4 to 0.5 at any dimension, against 0.83 to 0.63 for dim 2 to 16). `lattice`, which uses the 8-bit grid, has
+none of these limits.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ class Sparsity(DescriptorAttack):
 
     def unsuited(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
         if not extractor.exact_zeros:
-            return f"{self.name()} attacks descriptors with exact zeros; those of {extractor.name()} are not declared to have any"
+            return f"{self.name()} attacks descriptors with exact zeros; {extractor.name()} does not declare that its have any"
         return None
 
     def recover(self, view: View, rng: np.random.Generator) -> Floats:
@@ -64,7 +65,7 @@ class Sparsity(DescriptorAttack):
 
         origins, bases = release.origins.astype(np.float64), release.bases.astype(np.float64)
         owners, points = unit_vertices(origins, bases, self.pivots * release.dim, enough, rng)
-        return owners, unit_rows(points)
+        return owners, unit_rows(points.astype(np.float32))
 
 
 PLUGIN = Sparsity

@@ -32,8 +32,8 @@ def most_genuine(owners: Indices, rows: Floats, count: int) -> Indices:
 
     Returns
     -------
-    (count,) rows of `rows`, -1 for a keypoint without a candidate. Those that were met at one keypoint only come first, then those
-    with the most components equal to the greatest, then those with the most zeros, then the first.
+    (count,) indices of candidates, -1 for a keypoint without. First come those that were met at one keypoint alone, then those
+    with the most components equal to the greatest, then those with the most zeros.
     """
     order = np.lexsort((-zeros(rows), -ties(rows), recurring(owners, rows), owners))
     found, first = np.unique(owners[order], return_index=True)

@@ -1,12 +1,13 @@
 """Degenerate vertices of many polytopes {x = o + Bᵀ c : x >= 0} at once, by the simplex method in coordinates of the subspace.
 
-A vertex is where `dim` components vanish, its *frame*; it is degenerate where more do. With s the components of the frame,
-x = T [1, s] for a tableau T (D, 1 + dim), whose first column is the vertex. A pivot releases one component of the frame, follows
-that edge to where the objective is least, and puts the component that vanishes there into the frame: an update of rank one.
+A vertex is where `dim` components vanish, its *frame*; it is degenerate where more do. With s the components of the frame, x
+= T [1, s] for a tableau T (D, 1 + dim), whose first column is the vertex. A pivot releases one component of the frame,
+follows that edge to where the objective is least, and puts the component that vanishes there into the frame: an update of
+rank one.
 
-The objective is Σ_j w_j x_j, a negative x_j counting PENALTY w_j |x_j|, so that no feasible vertex is needed to begin with; along an
-edge it is convex and piecewise linear. At an optimum the weights become 1 / (x + SOFT) (reweighted L1; Candès, Wakin, Boyd 2008),
-and after ROUNDS of those they are drawn anew.
+The objective is Σ_j w_j x_j, a negative x_j counting PENALTY w_j |x_j|, so that no feasible vertex is needed to begin with.
+Along an edge it is convex and piecewise linear. At an optimum the weights become 1 / (x + SOFT) (reweighted L1; Candès,
+Wakin, Boyd 2008), and after ROUNDS of those they are drawn anew.
 """
 
 from __future__ import annotations
