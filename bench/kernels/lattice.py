@@ -28,9 +28,10 @@ Integers = NDArray[np.int64]
 BATCH = 256  # subspaces at a time
 WEIGHT = 1e6  # λ: float32 leaves errors of 1e-6 to 5e-5 in an integer vector's components
 INTEGRAL = 0.01  # a component this near to an integer is one
+MARGIN = 2.0  # by which chance's vectors shall be longer
 SLACK = 1.25  # a basis may need vectors longer than those that are sought
 ROUNDS = 4  # reductions, each with the components that the last left fractional
-FINENESS = 64.0  # of the grid on which the second form is reduced
+FINENESS = 64.0  # of the grid that bases are rounded to; roundings add up over k components of up to 255
 ON_SPHERE = 1e-6  # of ||x| - f| / |x|; float32 leaves 1e-7
 MOST = 1e6  # expected number of short vectors above which a lattice is given up
 
@@ -76,7 +77,9 @@ def integer_vectors(spans: Doubles, longest: float) -> list[Integers]:
     maps = spans @ inverse  # (N, D, k) M
     leverage = np.square(maps).sum(axis=2)  # (N, D)
     np.put_along_axis(leverage, free, -1.0, axis=1)
-    extra = min(length - k, math.ceil(0.75 * k) + 1)
+    # Of n components, an integer vector is about longest √(n / D), and the shortest by chance √(n / 2πe) λ^(e / n).
+    chance = math.log(MARGIN * longest * math.sqrt(2 * math.pi * math.e / length))
+    extra = min(length - k, math.ceil(k * chance / (math.log(WEIGHT) - chance)) + 1)
     telling = np.argsort(-leverage, axis=1)[:, :extra]  # (N, e) a component that hardly depends on y tells little
     return [_integral(m, rows, longest) for m, rows in zip(maps, telling, strict=True)]
 
@@ -113,11 +116,11 @@ def short_vectors(grams: Doubles, bounds: Doubles) -> tuple[Indices, Integers]:
     return owners, coefficients
 
 
-def reduced(basis: Doubles) -> Integers:
-    """LLL-reduce the rows of a basis, rounded to integers. (n, c) -> (n, c)"""
+def reduced(basis: Doubles) -> Doubles:
+    """LLL-reduce the rows of a basis, rounded to multiples of 1 / FINENESS. (n, c) -> (n, c)"""
     rows, columns = basis.shape
-    short = fmpz_mat(rows, columns, np.rint(basis).astype(np.int64).ravel().tolist()).lll()
-    return np.array([int(entry) for entry in short.entries()], dtype=np.int64).reshape(basis.shape)
+    short = fmpz_mat(rows, columns, np.rint(FINENESS * basis).astype(np.int64).ravel().tolist()).lll()
+    return np.array([float(entry) for entry in short.entries()]).reshape(basis.shape) / FINENESS
 
 
 def _integral(m: Doubles, rows: Indices, longest: float) -> Integers:
@@ -139,7 +142,7 @@ def _short(y: Doubles, m: Doubles, bound: float) -> Doubles:
     (r, k), e = y.shape, len(m)
     basis = np.zeros((r + e, k + e))
     basis[:r, :k], basis[:r, k:], basis[r:, k:] = y, WEIGHT * (y @ m.T), WEIGHT * np.eye(e)
-    short = reduced(basis).astype(np.float64)  # (r + e, k + e)
+    short = reduced(basis)  # (r + e, k + e)
     found = short[np.linalg.norm(short, axis=1) <= bound, :k]
     return found[found.any(axis=1)]
 
@@ -156,7 +159,7 @@ def _on_sphere(bases: Doubles, levels: Doubles, longest: float) -> tuple[Indices
     near = 1 / np.einsum("nq,nq->n", f, np.linalg.solve(grams, f[:, :, None])[:, :, 0])
     beta = np.maximum(near - (1 - near) / (rank - 1), 0.0) if rank > 1 else np.zeros(len(bases))
     forms = grams - beta[:, None, None] * f[:, :, None] * f[:, None, :]
-    change = np.stack([_reduction(form) for form in forms]).astype(np.float64)  # (n, q, q)
+    change = np.stack([_reduction(form) for form in forms])  # (n, q, q)
     bases, f = change @ bases, np.einsum("npq,nq->np", change, f)
     forms = change @ forms @ change.transpose(0, 2, 1)
     bounds = (1 - beta) * longest**2
@@ -170,10 +173,10 @@ def _on_sphere(bases: Doubles, levels: Doubles, longest: float) -> tuple[Indices
     return owner[good], x[good]
 
 
-def _reduction(form: Doubles) -> Integers:
+def _reduction(form: Doubles) -> Doubles:
     """The change of basis that reduces a positive definite form. (q, q) -> (q, q)"""
     rank = len(form)
-    return reduced(np.concatenate([FINENESS * np.linalg.cholesky(form), np.eye(rank)], axis=1))[:, rank:]
+    return reduced(np.concatenate([np.linalg.cholesky(form), np.eye(rank)], axis=1))[:, rank:]
 
 
 def _expected(forms: Doubles, bounds: Doubles) -> Doubles:
