@@ -32,6 +32,7 @@ MARGIN = 2.0  # by which chance's vectors shall be longer
 SLACK = 1.25  # a basis may need vectors longer than those that are sought
 ROUNDS = 4  # reductions, each with the components that the last left fractional
 FINENESS = 64.0  # of the grid that bases are rounded to; roundings add up over k components of up to 255
+DEFINITE = 0.999  # of the greatest β for which |x|² - β f² is positive
 ON_SPHERE = 1e-6  # of ||x| - f| / |x|; float32 leaves 1e-7
 MOST = 1e6  # expected number of short vectors above which a lattice is given up
 
@@ -157,7 +158,7 @@ def _on_sphere(bases: Doubles, levels: Doubles, longest: float) -> tuple[Indices
     grams = bases @ bases.transpose(0, 2, 1)  # (n, q, q)
     # The affine hull of q unit vectors of one cosine c is at the squared distance c + (1 - c) / q from zero; solved for c.
     near = 1 / np.einsum("nq,nq->n", f, np.linalg.solve(grams, f[:, :, None])[:, :, 0])
-    beta = np.maximum(near - (1 - near) / (rank - 1), 0.0) if rank > 1 else np.zeros(len(bases))
+    beta = np.clip(near - (1 - near) / max(rank - 1, 1), 0.0, DEFINITE * np.minimum(near, 1.0))
     forms = grams - beta[:, None, None] * f[:, :, None] * f[:, None, :]
     change = np.stack([_reduction(form) for form in forms])  # (n, q, q)
     bases, f = change @ bases, np.einsum("npq,nq->np", change, f)
