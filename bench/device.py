@@ -14,6 +14,12 @@ def pick_device() -> torch.device:
     return torch.device("cpu")
 
 
+def pick_double_device() -> torch.device:
+    """The device for float64, which MPS does not have."""
+    device = pick_device()
+    return torch.device("cpu") if device.type == "mps" else device
+
+
 def pick_dtype(device: torch.device) -> torch.dtype:
     """bf16 where the hardware multiplies it faster than float32, else float32."""
     if device.type == "cuda":

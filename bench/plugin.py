@@ -252,6 +252,10 @@ class Dataset(Plugin, ABC):
 class Extractor(Plugin, ABC):
     """Turns a photograph into `Features`."""
 
+    # What is publicly known of its descriptors, which attacks may rest on.
+    exact_zeros: bool = False  # none is negative, and many components are exactly zero
+    eight_bit: bool = False  # each is an 8-bit integer vector, scaled to unit norm
+
     @abstractmethod
     def extract(self, image: np.ndarray, source: Path | None = None) -> Features:
         """Extract from an (H, W, 3) uint8 RGB image, in the order of `Features.by_position`.

@@ -9,11 +9,15 @@ import pytest
 from fakes import texture
 from PIL import Image
 
+from attacks.lattice import Lattice
+from attacks.sparsity import Sparsity
 from bench.datasets import photographs
 from bench.errors import UnitError, UserError
 from bench.features.hloc import Hloc
 from bench.features.sift import Sift
+from bench.public import Public
 from bench.testing import check_extractor
+from defenses.affine import Affine
 
 WIDTH, HEIGHT = 400, 200
 KEYPOINTS = np.array([[100.0, 0.0], [299.0, 199.0], [199.5, 99.5], [10.0, 10.0], [390.0, 10.0]])
@@ -47,6 +51,13 @@ def features(tmp_path: Path, name: str = "street/a.png", **datasets: Any) -> Pat
 
 def extract(path: Path, photograph: Path, **more: Any) -> Any:
     return Hloc(path=path, **more).extract(photographs.read(photograph).pixels, photograph)
+
+
+def test_what_is_declared_of_the_descriptors_decides_which_attacks_apply(tmp_path: Path) -> None:
+    path = features(tmp_path)
+    for attack, declared in ((Sparsity(), {"exact_zeros": True}), (Lattice(), {"eight_bit": True})):
+        assert "hloc does not declare" in (attack.inapplicable(Affine(), Hloc(path=path), Public()) or "")
+        assert attack.inapplicable(Affine(), Hloc(path=path, **declared), Public()) is None
 
 
 def test_keypoints_follow_the_cut_and_the_scale(tmp_path: Path, photograph: Path) -> None:

@@ -29,6 +29,8 @@ class Hloc(Extractor):
 
     path: Path
     dimension: int = 128  # of a descriptor
+    exact_zeros: bool = False  # whether none is negative and many components are exactly zero, as of SIFT and RootSIFT
+    eight_bit: bool = False  # whether each is an 8-bit integer vector, scaled
 
     def __post_init__(self) -> None:
         if not self.path.is_file():

@@ -22,6 +22,9 @@ class Sift(Extractor):
     (`upright=false`, the paper's) leaves that to be inferred.
     """
 
+    exact_zeros = True
+    eight_bit = True
+
     upright: bool = True
     contrast_threshold: float = 0.002  # lower than OpenCV's .04: 256 x 256 pixels shall give about 600 to 1,000 keypoints
     edge_threshold: float = 15.0

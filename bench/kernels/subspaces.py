@@ -58,6 +58,15 @@ def feet_and_frames(release: Subspaces) -> tuple[Doubles, Doubles]:
     return _outside(release.origins.astype(np.float64), frames), frames
 
 
+def guesses(release: Subspaces) -> Floats:
+    """For each subspace the direction of its point nearest to zero, negative components cut: what one guesses of a descriptor
+    that is nowhere negative and of unit norm, if D is all one knows. -> (N, D) unit norm
+    """
+    cut = np.maximum(feet_and_frames(release)[0], 0.0)
+    cut[~cut.any(axis=1)] = 1.0
+    return unit_rows(cut.astype(np.float32))
+
+
 def project(release: Subspaces, points: Doubles) -> Doubles:
     """The point of each subspace nearest to its own point. (N, D) -> (N, D)"""
     feet, frames = feet_and_frames(release)
