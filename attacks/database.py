@@ -19,7 +19,7 @@ from bench.plugin import Defense, DescriptorAttack, Extractor, Lifting, View
 from bench.public import Public
 from bench.types import Bytes, Floats, Indices, Knowledge, Subspaces
 
-BATCH = 128  # subspaces whose words are gathered at a time
+GATHERED = 2**15  # words that are compared with adversarial ones at a time
 TOUCHING = 1e-12  # a word that is nearer to D than this counts as so near, and outweighs every other
 
 
@@ -30,8 +30,8 @@ class Database(DescriptorAttack):
     accepts = (Subspaces,)
     needs = frozenset({Knowledge.DATABASE})
 
-    neighbours: int = 20  # |V|: words next nearest to the subspace
-    estimators: int = 5  # |U|: those of them that the estimate is made of
+    neighbours: int = 4000  # |V|: words next nearest to the subspace
+    estimators: int = 3  # |U|: those of them that the estimate is made of
 
     def __post_init__(self) -> None:
         if not 1 <= self.estimators <= self.neighbours:
@@ -55,22 +55,27 @@ class Database(DescriptorAttack):
         if len(words) <= adversarial:
             raise UserError(f"database: {len(words)} words leave none beside the {adversarial} in each subspace")
         found, distances = nearest_to_subspaces(release, words, adversarial + self.neighbours)
-        return estimate(release, words, found, distances, adversarial, self.estimators)
+        a, v = found[:, :adversarial], found[:, adversarial:]
+        return estimate(release, words, v, distances[:, adversarial:], closeness(words, v, a), self.estimators)
 
 
-def estimate(release: Subspaces, words: Bytes, found: Indices, distances: Doubles, adversarial: int, estimators: int) -> Floats:
-    """d̂ of each subspace from its nearest words, nearest first. (K, D) words, (N, adversarial + |V|) twice -> (N, D) unit rows"""
-    means = np.empty((len(release), words.shape[1]))
-    for start in range(0, len(release), BATCH):
-        batch = slice(start, start + BATCH)
-        rows = unit_rows(words[found[batch]])  # (n, adversarial + |V|, D)
-        a, v = rows[:, :adversarial], rows[:, adversarial:]
-        closeness = (v @ a.transpose(0, 2, 1)).max(axis=2)  # (n, |V|) the greater the cosine, the shorter min_j |â_j − v|
-        chosen = np.argsort(closeness, axis=1, kind="stable")[:, :estimators]  # (n, |U|)
-        u = np.take_along_axis(v, chosen[:, :, None], axis=1)  # (n, |U|, D)
-        apart = np.take_along_axis(distances[batch, adversarial:], chosen, axis=1)  # (n, |U|)
-        weights = 1 / np.maximum(apart, TOUCHING)
-        means[batch] = np.einsum("nu,nud->nd", weights / weights.sum(axis=1, keepdims=True), u)
+def closeness(words: Bytes, v: Indices, a: Indices) -> Floats:
+    """The greatest cosine of each v and any a: the greater, the shorter min_j |â_j − v|. (K, D), (N, |V|), (N, A) -> (N, |V|)"""
+    greatest = np.empty(v.shape, dtype=np.float32)
+    step = max(1, GATHERED // v.shape[1])
+    for start in range(0, len(v), step):
+        batch = slice(start, start + step)
+        adversaries = unit_rows(words[a[batch]])  # (n, A, D)
+        greatest[batch] = (unit_rows(words[v[batch]]) @ adversaries.transpose(0, 2, 1)).max(axis=2)
+    return greatest
+
+
+def estimate(release: Subspaces, words: Bytes, v: Indices, distances: Doubles, close: Floats, estimators: int) -> Floats:
+    """d̂ of each subspace from the words near it, their distances and their closeness. (K, D), (N, |V|) thrice -> (N, D)"""
+    chosen = np.argsort(close, axis=1, kind="stable")[:, :estimators]  # (N, |U|)
+    u = unit_rows(words[np.take_along_axis(v, chosen, axis=1)])  # (N, |U|, D)
+    weights = 1 / np.maximum(np.take_along_axis(distances, chosen, axis=1), TOUCHING)
+    means = np.einsum("nu,nud->nd", weights / weights.sum(axis=1, keepdims=True), u)
     return unit_rows(project(release, means).astype(np.float32))
 
 

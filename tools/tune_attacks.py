@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from attacks.database import Database, estimate
+from attacks.database import Database, closeness, estimate
 from bench import registry, spec
 from bench.datasets import photographs
 from bench.errors import UserError
@@ -68,17 +68,19 @@ def recover_by_database(seen: View, settings: Sequence[Database]) -> Iterator[Fl
     assert isinstance(release, Subspaces)
     assert isinstance(defense, Lifting)
     words, adversarial = seen.know(Knowledge.DATABASE).words, defense.adversarial
-    most = adversarial + max(attack.neighbours for attack in settings)
-    found, distances = nearest_to_subspaces(release, words, most)
+    most = max(attack.neighbours for attack in settings)
+    found, distances = nearest_to_subspaces(release, words, adversarial + most)
+    v, distances = found[:, adversarial:], distances[:, adversarial:]
+    close = closeness(words, v, found[:, :adversarial])
     for attack in settings:
-        few = slice(adversarial + attack.neighbours)
-        yield estimate(release, words, found[:, few], distances[:, few], adversarial, attack.estimators)
+        few = slice(attack.neighbours)
+        yield estimate(release, words, v[:, few], distances[:, few], close[:, few], attack.estimators)
 
 
 TUNINGS = (
     Tuning(
         attack=Database,
-        grid={"neighbours": (1, 2, 3, 5, 10, 20, 50, 100, 200), "estimators": (1, 2, 3, 5, 10, 20)},
+        grid={"neighbours": (10, 100, 1000, 2000, 4000, 8000), "estimators": (1, 2, 3, 5, 10)},
         points=("affine:dim=2", "affine:dim=4", "affine:dim=8", "affine:dim=16"),
         recover=recover_by_database,
     ),
@@ -90,7 +92,7 @@ def main() -> None:
     names = [tuning.attack.name() for tuning in TUNINGS]
     parser.add_argument("--data", type=Path, required=True, help="the folder of tune.txt and train/")
     parser.add_argument("--attack", choices=names, action="append", help="one to tune, may be repeated; all by default")
-    parser.add_argument("--keypoints", type=int, default=50, help="of each photograph")
+    parser.add_argument("--keypoints", type=int, default=25, help="of each photograph")
     args = parser.parse_args()
     photos = [args.data / "train" / name for name in (args.data / "tune.txt").read_text().split()]
     for tuning in TUNINGS:

@@ -24,7 +24,10 @@ Doubles = NDArray[np.float64]
 BLOCK = 2048  # words in a block
 ROWS = 1024  # rows of B and p that share one reading of the words: a block of products stays near the processor
 GROUP = 32  # words that are looked at one by one only if the best of them may count
-PAIRS = 1024  # pairs of a subspace and a word that float64 looks at together
+SCORES = 2**23  # scores that may wait for it to be known which of them can count
+NEAR = 1024  # words asked for, of several subspaces, that float64 decides on together
+FAR = 1e9  # the distance of no word
+TIE = 1e-12  # distances that differ by less count as equal; float64 errs by about 1e-16
 
 
 def nearest_to_subspaces(release: Subspaces, words: Bytes | Floats, count: int = 1) -> tuple[Indices, Doubles]:
@@ -37,14 +40,14 @@ def nearest_to_subspaces(release: Subspaces, words: Bytes | Floats, count: int =
 
     Returns
     -------
-    (N, min(count, K)) int64 and float64. Distances are those of float64 from the subspace as it was released: in float32, so that
-    a word which the defense put there lies about 1e-7 off.
+    (N, min(count, K)) int64 and float64. Distances are from the subspace as it was released: in float32, so that a word which the
+    defense put there lies about 1e-7 off.
     """
     count = min(count, len(words))
     feet, frames = feet_and_frames(release)
     found = np.empty((len(release), count), dtype=np.int64)
     distances = np.empty((len(release), count))
-    step = max(1, ROWS // (release.dim + 1))
+    step = max(1, min(ROWS // (release.dim + 1), SCORES // (count * GROUP)))
     for start in range(0, len(release), step):
         batch = slice(start, start + step)
         rows, near = _possible(feet[batch], frames[batch], words, count)
@@ -55,7 +58,8 @@ def nearest_to_subspaces(release: Subspaces, words: Bytes | Floats, count: int =
 def feet_and_frames(release: Subspaces) -> tuple[Doubles, Doubles]:
     """The point of each subspace nearest to zero, and a basis orthonormal to float64. -> (N, D), (N, dim, D)"""
     frames = np.linalg.qr(release.bases.astype(np.float64).transpose(0, 2, 1))[0].transpose(0, 2, 1)
-    return _outside(release.origins.astype(np.float64), frames), frames
+    origins = release.origins.astype(np.float64)[:, None]  # (N, 1, D)
+    return (origins - origins @ frames.transpose(0, 2, 1) @ frames)[:, 0], frames
 
 
 def guesses(release: Subspaces) -> Floats:
@@ -70,46 +74,45 @@ def guesses(release: Subspaces) -> Floats:
 def project(release: Subspaces, points: Doubles) -> Doubles:
     """The point of each subspace nearest to its own point. (N, D) -> (N, D)"""
     feet, frames = feet_and_frames(release)
-    return points - _outside(points - feet, frames)
-
-
-def _outside(offsets: Doubles, frames: Doubles) -> Doubles:
-    """The part of each vector that is orthogonal to the subspace. (n, D), (n, dim, D) -> (n, D)
-
-    Each row is summed by itself, and so equal rows give equal results wherever they stand.
-    """
-    return offsets - np.einsum("nm,nmd->nd", np.einsum("nmd,nd->nm", frames, offsets), frames)
+    return feet + (points[:, None] @ frames.transpose(0, 2, 1) @ frames)[:, 0]
 
 
 def _possible(feet: Doubles, frames: Doubles, words: Bytes | Floats, count: int) -> tuple[Indices, Indices]:
-    """Pairs of a subspace and a word that may be one of its nearest. (n, D), (n, dim, D), (K, D) -> (P,), (P,)"""
+    """Pairs of a subspace and a word that may be one of its nearest, by subspace. (n, D), (n, dim, D), (K, D) -> (P,) twice"""
     device = pick_device()
     dtype = pick_dtype(device)
     exact = np.concatenate([feet[:, None], frames], axis=1).transpose(1, 0, 2)  # (1 + dim, n, D)
     coarse = torch.from_numpy(exact).to(dtype)
-    allowed = (
-        torch.from_numpy(2 * _error(exact, coarse.double().numpy(), dtype, words.dtype)).float().to(device)[:, None]
-    )  # (n, 1)
-    planes = coarse.to(device)
+    error = _error(exact, coarse.double().numpy(), dtype, words.dtype)  # (n,)
+    planes, allowed = coarse.to(device), torch.from_numpy(2 * error).float().to(device)[:, None]
     # The highest scores of the words so far, no two of one group: the lowest of them bounds the count-th highest from below.
     best = torch.full((len(feet), count), torch.finfo(torch.float32).min, device=device)
-    pairs = []
+    waiting, pairs = [], []
     for start in range(0, len(words), BLOCK):
         scores = _scores(planes, torch.from_numpy(words[start : start + BLOCK]).to(device))  # (n, K')
         ragged = -scores.shape[1] % GROUP
         if ragged:
             scores = torch.nn.functional.pad(scores, (0, ragged), value=-torch.inf)
         groups = scores.view(len(feet), GROUP, -1)  # (n, 32, G)
-        maxima = groups.amax(dim=1)  # (n, G)
-        best = torch.cat([best, maxima], dim=1).topk(count, dim=1).values
+        waiting.append((start, groups, groups.amax(dim=1)))
+        if sum(maxima.shape[1] for _, _, maxima in waiting) < count and start + BLOCK < len(words):
+            continue
+        best = torch.cat([best, *(maxima for _, _, maxima in waiting)], dim=1).topk(count, dim=1).values
         least = best[:, -1:] - allowed  # (n, 1)
-        row, group = (maxima >= least).nonzero(as_tuple=True)
-        members = groups[row, :, group]  # (S, 32)
-        hit, place = (members >= least[row]).nonzero(as_tuple=True)
-        pairs.append((row[hit], start + place * groups.shape[2] + group[hit], members[hit, place]))
+        pairs += [_at_least(least, *block) for block in waiting]
+        waiting = []
     rows, near, found = (torch.cat(part) for part in zip(*pairs, strict=True))
     kept = found >= least[rows, 0]  # as it stands now that all words were seen
-    return rows[kept].cpu().numpy(), near[kept].cpu().numpy()
+    rows, order = rows[kept].sort(stable=True)
+    return rows.cpu().numpy(), near[kept][order].cpu().numpy()
+
+
+def _at_least(least: Tensor, start: int, groups: Tensor, maxima: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The words of a block that score enough: subspace, word, score. (n, 1), start, (n, 32, G), (n, G) -> (P,) thrice"""
+    row, group = (maxima >= least).nonzero(as_tuple=True)
+    members = groups[row, :, group]  # (S, 32)
+    hit, place = (members >= least[row]).nonzero(as_tuple=True)
+    return row[hit], start + place * groups.shape[2] + group[hit], members[hit, place]
 
 
 def _scores(planes: Tensor, block: Tensor) -> Tensor:
@@ -153,13 +156,25 @@ def _error(exact: Doubles, rounded: Doubles, dtype: torch.dtype, words: np.dtype
 def _decide(
     feet: Doubles, frames: Doubles, words: Bytes | Floats, rows: Indices, near: Indices, count: int
 ) -> tuple[Indices, Doubles]:
-    """Of the possible words of each subspace the nearest. (n, D), (n, dim, D), (K, D), (P,), (P,) -> (n, count) twice"""
-    distances = np.empty(len(rows))
-    for start in range(0, len(rows), PAIRS):
-        part = slice(start, start + PAIRS)
-        offsets = unit_rows(words[near[part]]) - feet[rows[part]]  # (PAIRS, D) float64
-        distances[part] = np.linalg.norm(_outside(offsets, frames[rows[part]]), axis=1)
-    order = np.lexsort((near, distances, rows))
-    first = np.searchsorted(rows[order], np.arange(len(feet)))
-    chosen = order[first[:, None] + np.arange(count)]  # (n, count)
-    return near[chosen], distances[chosen]
+    """Of the possible words of each subspace the nearest. (n, D), (n, dim, D), (K, D), (P,) twice -> (n, count) twice"""
+    found, measured = np.empty((len(feet), count), dtype=np.int64), np.empty((len(feet), count))
+    few = max(1, NEAR // count)
+    for start in range(0, len(feet), few):
+        part = slice(start, start + few)
+        first, last = (np.searchsorted(rows, np.arange(len(feet))[part], side)[:, None] for side in ("left", "right"))
+        places = first + np.arange((last - first).max())  # (f, c) of which each subspace uses as many as it has words
+        table = near[np.minimum(places, last - 1)]
+        offsets = unit_rows(words[table]) - feet[part, None]  # (f, c, D) float64
+        offsets -= offsets @ frames[part].transpose(0, 2, 1) @ frames[part]
+        distances = np.where(places < last, np.linalg.norm(offsets, axis=2), FAR)  # (f, c)
+        found[part], measured[part] = _ranked(table, distances, count)
+    return found, measured
+
+
+def _ranked(table: Indices, distances: Doubles, count: int) -> tuple[Indices, Doubles]:
+    """The words of least distance in each row, ties to the lowest index. (f, c) twice -> (f, count) twice"""
+    order = np.argsort(distances, axis=1)
+    table, distances = np.take_along_axis(table, order, axis=1), np.take_along_axis(distances, order, axis=1)
+    ranks = (np.diff(distances, axis=1, prepend=0) > TIE).cumsum(axis=1)
+    order = np.lexsort((table, ranks), axis=1)[:, :count]
+    return np.take_along_axis(table, order, axis=1), np.take_along_axis(distances, order, axis=1)
