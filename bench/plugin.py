@@ -112,7 +112,8 @@ class Lifted:
 class Lifting(Defense):
     """A defense that hides each descriptor in a subspace, and may lead it through words of a database on purpose.
 
-    How many words is public, as the whole configuration is; an attack on such words asks for this type.
+    How many words is public, as the whole configuration is; an attack on such words asks for this type. The field `database`
+    names where they are from.
     """
 
     releases = Subspaces

@@ -9,9 +9,10 @@ from fakes import trial
 from bench.errors import UserError
 from bench.features.sift import Sift
 from bench.kernels.search import unit_rows
+from bench.kernels.sharing import company, nearest_that_meet, stacked
 from bench.plugin import Asset
 from bench.public import Public
-from bench.tasks.collisions import Collisions, nearest_meeting, no_collision
+from bench.tasks.collisions import Collisions, no_collision
 from bench.testing import example_features, small_dictionary
 from bench.types import Features, Subspaces
 from defenses.affine import Affine
@@ -39,24 +40,24 @@ def residual(point: np.ndarray, directions: np.ndarray) -> float:
     return float(np.linalg.norm(point - directions.T @ np.linalg.lstsq(directions.T, point)[0]))
 
 
-def test_nearest_meeting_is_that_of_brute_force(database: Asset) -> None:
+def test_distances_to_what_meets_are_those_of_brute_force(database: Asset) -> None:
     defense, public = lifting(database), Public()
     lifted = defense.lifted(OWN, public, np.random.default_rng(0))
     words = unit_rows(public.dictionary(database).words)
     points = np.concatenate([OWN.descriptors[:, None], words[lifted.words]], axis=1).astype(np.float64)  # (10, 3, D)
     (other,) = releases(defense, [example_features(8, seed=11)])
+    every = stacked([lifted.release, other])
     expected = np.full((10, 3), np.inf)
     for i in range(10):
-        for j in range(8):
-            o1, b1, o2, b2 = (
-                a.astype(np.float64)
-                for a in (lifted.release.origins[i], lifted.release.bases[i], other.origins[j], other.bases[j])
-            )
-            if residual(o2 - o1, np.concatenate([b1, b2])) < 1e-5:
+        o1, b1 = lifted.release.origins[i].astype(np.float64), lifted.release.bases[i].astype(np.float64)
+        for j in range(18):
+            o2, b2 = every.origins[j].astype(np.float64), every.bases[j].astype(np.float64)
+            if i != j and residual(o2 - o1, np.concatenate([b1, b2])) < 1e-5:
                 expected[i] = np.minimum(expected[i], [residual(point - o2, b2) for point in points[i]])
-    np.testing.assert_allclose(nearest_meeting(lifted.release, points, other), expected, atol=1e-5)
-    assert 0 < np.isfinite(expected[:, 0]).sum() < 10
-    assert (expected[:, 1:] < 1e-5).any()
+    shared = company(lifted.release, iter([other]), 2, enough=1)
+    assert shared.kept == 1
+    np.testing.assert_allclose(nearest_that_meet(points, shared), expected, atol=1e-5)
+    assert 0 < (expected[:, 1:] < 1e-5).sum() < 20
 
 
 def test_no_collision_by_hand() -> None:
@@ -69,7 +70,7 @@ def test_no_collision_by_hand() -> None:
 def metrics(database: Asset, secrets: list[Features], dim: int = 4, **more: float) -> dict[str, float]:
     defense = lifting(database, dim)
     others = releases(defense, secrets)
-    found = Collisions(others=len(others), **more).judge(trial(defense, OWN, others=others)).metrics
+    found = Collisions(others=len(others), coverage=1, **more).judge(trial(defense, OWN, others=others)).metrics
     return {name: value for name, value in found.items() if value is not None}
 
 
@@ -80,7 +81,8 @@ def test_enough_other_releases_meet_every_word_and_none_comes_near(database: Ass
         "no_collision_covered": 1,
         "coverage": 1,
         "covered": 1,
-        "same_sub_database": 4,
+        "releases_asked": 4,
+        "releases_kept": 4,
     }
 
 
@@ -96,21 +98,28 @@ def test_a_tolerance_above_every_distance_leaves_nothing(database: Asset) -> Non
 
 def test_releases_of_another_database_meet_nothing(database: Asset, tmp_path: Path) -> None:
     others = releases(lifting(small_dictionary(tmp_path, 24, seed=9)), [example_features(40, seed=11)])
-    found = Collisions(others=1).judge(trial(lifting(database), OWN, others=others)).metrics
-    assert (found["coverage"], found["no_collision"], found["same_sub_database"]) == (0, 0, 0)
+    found = Collisions(others=1).judge(trial(lifting(database), OWN.take(np.arange(1)), others=others)).metrics
+    assert found["releases_asked"] == 1
+    assert (found["coverage"], found["no_collision"], found["releases_kept"]) == (0, 0, 0)
     assert found["no_collision_covered"] is None
 
 
 def test_only_as_many_others_as_asked_for(database: Asset) -> None:
     defense = lifting(database)
     others = releases(defense, [example_features(40, seed=seed) for seed in (11, 12, 13)])
-    assert Collisions(others=2).judge(trial(defense, OWN, others=others)).metrics["same_sub_database"] == 2
+    assert Collisions(others=2, coverage=1).judge(trial(defense, OWN, others=others)).metrics["releases_asked"] == 2
 
 
 def test_what_does_not_fit_is_refused(database: Asset) -> None:
     assert Collisions().inapplicable(lifting(database), None, Sift(), Public()) is None
-    assert "ldp does not lift" in str(Collisions().inapplicable(LDP(dictionary=database), None, Sift(), Public()))
+    assert "ldp does not say" in str(Collisions().inapplicable(LDP(dictionary=database), None, Sift(), Public()))
     assert "no word" in str(Collisions().inapplicable(Affine(lifting="random", database=database), None, Sift(), Public()))
-    for wrong in ({"others": 0}, {"tolerance": -0.1}, {"tolerance": float("nan")}):
+    for wrong in (
+        {"others": -1},
+        {"coverage": 1.1},
+        {"coverage": float("nan")},
+        {"tolerance": -0.1},
+        {"tolerance": float("nan")},
+    ):
         with pytest.raises(UserError, match="must be"):
             Collisions(**wrong)  # type: ignore[arg-type]

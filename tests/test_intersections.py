@@ -87,7 +87,7 @@ def test_defenses_without_words_are_refused(tmp_path: Path) -> None:
     small = small_dictionary(tmp_path)
     task = Intersections()
     assert task.inapplicable(Affine(database=small), None, Sift(), Public()) is None
-    assert "ldp does not lift" in str(task.inapplicable(LDP(dictionary=small), None, Sift(), Public()))
+    assert "ldp does not say" in str(task.inapplicable(LDP(dictionary=small), None, Sift(), Public()))
     assert "no word" in str(task.inapplicable(Affine(lifting="random", database=small), None, Sift(), Public()))
     for wrong in ({"ratio": 0.0}, {"ratio": float("nan")}, {"subspaces": -1}):
         with pytest.raises(UserError, match="must be"):

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from fakes import album
+from fakes import texture
 from PIL import Image
 
 from bench import cli, progress, registry
@@ -28,8 +28,11 @@ TABLES = sorted(tables.everything())
 
 @pytest.fixture(scope="module")
 def images(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two pictures of some 60 keypoints."""
-    return album(tmp_path_factory.mktemp("reproduce") / "album")
+    """Two pictures of some 30 keypoints."""
+    folder = tmp_path_factory.mktemp("reproduce")
+    for number in range(2):
+        texture(number, (56, 48)).save(folder / f"{number}.png")
+    return folder
 
 
 @pytest.fixture(scope="module")

@@ -34,6 +34,8 @@ def test_holds_the_packages_and_the_assets_and_no_tests(wheel):
     assert {name.split("/")[0] for name in names if ".dist-info" not in name} == set(PACKAGES)
     for path in (ROOT / "bench" / "assets").iterdir():
         assert f"bench/assets/{path.name}" in names
+    for path in (ROOT / "leaderboard" / "reproduce" / "paper").iterdir():
+        assert f"leaderboard/reproduce/paper/{path.name}" in names
     assert wheel.name.startswith("feature_privacy_bench-")
 
 

@@ -13,11 +13,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bench.kernels.meetings import Meetings, joined, meetings, meetings_within
+from bench.kernels.meetings import Doubles, Meetings, joined, meetings, meetings_within
 from bench.types import Subspaces
 
 BATCH = 16  # releases that are looked at together
 TELLING = 8.0  # meetings with the sample of a release that shares, on average: one in 3,000 has none
+PAIRS = 1024  # meetings that are measured at a time
 APART = 1e-5  # points whose images on a line are nearer than this are one
 
 
@@ -90,3 +91,18 @@ def _coverage(met: Meetings, words: int) -> float:
     order = np.lexsort((images, certain.first))
     again = (np.diff(certain.first[order]) == 0) & (np.diff(images[order]) < APART)
     return (len(certain) - int(again.sum())) / words
+
+
+def nearest_that_meet(points: Doubles, shared: Company) -> Doubles:
+    """From points of each of the target's subspaces to the nearest of those that meet it; infinite where none does.
+
+    min_j dist(x_i, Q'_j) in the paper's terms. (N, p, D) -> (N, p)
+    """
+    nearest = np.full(points.shape[:2], np.inf)
+    for start in range(0, len(shared.meetings), PAIRS):
+        pairs = shared.meetings.take(np.arange(start, min(start + PAIRS, len(shared.meetings))))
+        other = shared.subspaces.take(pairs.second)
+        offsets = points[pairs.first] - other.origins[:, None]  # (P, p, D)
+        outside = offsets - (offsets @ other.bases.transpose(0, 2, 1)) @ other.bases
+        np.minimum.at(nearest, pairs.first, np.linalg.norm(outside, axis=2))
+    return nearest

@@ -24,7 +24,7 @@ from bench import fields
 from bench.errors import UnitError, UserError
 from bench.kernels.search import unit_rows
 from bench.kernels.subspaces import nearest_to_subspaces
-from bench.plugin import Attack, Defense, Extractor, Lifting, Outcome, Task, Trial
+from bench.plugin import Attack, Defense, Extractor, Lifting, Outcome, Task, Trial, leads_through_no_word
 from bench.public import Public
 from bench.types import Features, Floats
 
@@ -51,9 +51,7 @@ class Intersections(Task):
             raise UserError(f"intersections: subspaces must be at least 0, got {self.subspaces}")
 
     def inapplicable(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> str | None:
-        if not isinstance(defense, Lifting) or "database" not in fields.asset_fields(defense):
-            return f"{defense.name()} does not lift descriptors to subspaces through words of a database"
-        return None if defense.adversarial else f"{defense.name()} as configured leads its subspaces through no word"
+        return leads_through_no_word(defense)
 
     def resolved(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> Mapping[str, Any]:
         return {}

@@ -63,8 +63,8 @@ def reconstruction(setting: Setting) -> Reconstruction:
     return Reconstruction() if network == Asset("shipped") else Reconstruction(inverter=f"dia:weights={network}")
 
 
-def build(kind: Kind[P], name: str, given: Mapping[str, Any], assets: Mapping[str, Asset] | None = None) -> P:
-    """The plugin of that name with the fields `given`, and with those of `assets` that it has a field for."""
+def build(kind: Kind[P], name: str, given: Mapping[str, Any], where_there_are: Mapping[str, Any] | None = None) -> P:
+    """The plugin of that name with the fields `given`, and with those others that it has."""
     plugin = registry.lookup(kind, name)
     types = fields.field_types(plugin)
-    return spec.build(plugin, {**given, **{field: asset for field, asset in (assets or {}).items() if field in types}})
+    return spec.build(plugin, {**given, **{field: value for field, value in (where_there_are or {}).items() if field in types}})

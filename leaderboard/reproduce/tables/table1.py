@@ -31,14 +31,14 @@ def rows(setting: Setting) -> tuple[Row, ...]:
         attack=build(registry.ATTACK, "dia", {"weights": materials.raw_network}),
         task=task,
     )
-    assets = {"weights": materials.affine_network, "database": materials.public_database}
+    where_there_are = {"weights": materials.affine_network, "database": materials.public_database, **setting.profile.reduced}
     lifted = [
         Row(
             name=name(line["attack"], line["dim"]),
             labels={"attack": line["attack"], "dim": line["dim"]},
             paper=published.numbers(line, PRINTED),
             defense=lifting(int(line["dim"]), setting),
-            attack=build(registry.ATTACK, line["attack"], {}, assets),
+            attack=build(registry.ATTACK, line["attack"], {}, where_there_are),
             task=task,
         )
         for line in lines[:-1]
