@@ -155,7 +155,7 @@ def test_noise_is_judged_by_projections(tmp_path: Path) -> None:
 
 def test_what_is_remembered_counts_once_a_call(tmp_path: Path) -> None:
     found = audited(LDP(epsilon=2.0, memoize=True), tmp_path, words=16)
-    assert found.verdict == "consistent"
+    assert found.verdict in ("consistent", "tight")
     assert [finding.family for finding in found.findings] == ["membership", "position"]
     assert found.strongest.epsilon > 1.5
     assert all(finding.alike and finding.trials < TRIALS / 2 for finding in found.findings)

@@ -54,7 +54,7 @@ def test_without_a_margin_it_would_be_wrong(rng, monkeypatch):
         np.clip(base + rng.integers(-60, 61, (count, 128)), 0, 255).astype(np.uint8) for count in (3 * search.BLOCK, 4000)
     )
     assert np.array_equal(nearest_rows(queries, words), brute_force(queries, words))
-    monkeypatch.setattr(search, "MARGIN", dict.fromkeys(search.MARGIN, 0.0))
+    monkeypatch.setattr(search, "margin", lambda best, errors, dtype: torch.zeros_like(best))
     monkeypatch.setattr(search, "pick_dtype", lambda device: torch.bfloat16)
     assert not np.array_equal(nearest_rows(queries, words), brute_force(queries, words))
 

@@ -17,10 +17,7 @@ from bench.types import Bytes, Floats, Indices
 BLOCK = 2048  # words in a block: a block and its scores stay in the cache
 BATCH = 512  # queries that share one reading of the words
 
-# How far below the greatest approximate cosine the true one can be. A rounding errs by half a unit in the last place, for bf16
-# (8 binary digits) by at most 2^-8 of the number; there are three, of both factors and of the result; two scores are compared;
-# Cauchy-Schwarz bounds sums. The rest is for products of these errors and for sums in float32.
-MARGIN = {torch.bfloat16: 2 * 3 * 2.0**-8 + 2e-4, torch.float32: 1e-4}
+SLACK = 1e-4  # for sums in float32 and for products of errors
 
 
 def unit_rows(rows: Bytes | Floats) -> Floats:
@@ -37,7 +34,9 @@ class WordIndex:
         device = pick_device()
         self._dtype = pick_dtype(device)
         self._words = words
-        self._coarse = torch.from_numpy(unit_rows(words)).to(device, self._dtype)  # (K, D)
+        exact = torch.from_numpy(unit_rows(words))
+        self._coarse = exact.to(device, self._dtype)  # (K, D)
+        self._error = float(rounding(exact, self._coarse).max())
 
     def nearest(self, queries: Bytes | Floats, progress: Callable[[int], object] = lambda done: None) -> Indices:
         """Return for each query the index of the word of greatest cosine, ties to the lowest index.
@@ -54,16 +53,18 @@ class WordIndex:
         found = np.empty(len(queries), dtype=np.int64)
         for start in range(0, len(queries), BATCH):
             batch = queries[start : start + BATCH]
-            coarse = torch.from_numpy(unit_rows(batch)).to(self._coarse.device, self._dtype)
-            found[start : start + BATCH] = self._decide(batch, *self._possible(coarse))
+            exact = torch.from_numpy(unit_rows(batch))
+            coarse = exact.to(self._coarse.device, self._dtype)
+            found[start : start + BATCH] = self._decide(batch, *self._possible(coarse, rounding(exact, coarse) + self._error))
             progress(len(batch))
         return found
 
-    def _possible(self, queries: Tensor) -> tuple[np.ndarray, np.ndarray]:
-        """Pairs of a query and a word that may be its nearest. (n, D) -> (P,), (P,)"""
+    def _possible(self, queries: Tensor, errors: Tensor) -> tuple[np.ndarray, np.ndarray]:
+        """Pairs of a query and a word that may be its nearest. (n, D), (n,) of rounded factors -> (P,), (P,)"""
         blocks = self._coarse.split(BLOCK)
         tops = torch.stack([block_maxima(queries, block) for block in blocks], dim=1).float()  # (n, blocks)
-        least = tops.amax(dim=1) - MARGIN[self._dtype]  # (n,)
+        best = tops.amax(dim=1)
+        least = best - margin(best, errors, self._dtype)  # (n,)
         rows, words = [], []
         for number, block in enumerate(blocks):
             near = (tops[:, number] >= least).nonzero()[:, 0]
@@ -82,6 +83,21 @@ class WordIndex:
         order = np.lexsort((words, -scores, rows))
         first = np.unique(rows[order], return_index=True)[1]
         return words[order][first]
+
+
+def rounding(exact: Tensor, coarse: Tensor) -> Tensor:
+    """How far each row was moved. (n, D), (n, D) -> (n,) on the device of the second"""
+    return (coarse.float() - exact.to(coarse.device)).norm(dim=1)
+
+
+def margin(best: Tensor, errors: Tensor, dtype: torch.dtype) -> Tensor:
+    """How far below the greatest approximate cosine that of the nearest word can be. (n,), (n,) -> (n,)
+
+    By Cauchy-Schwarz a cosine is off by at most the sum of the distances that its unit rows were moved, and then by half a unit
+    in the last place as it is rounded itself: a quarter of the type's `eps` below one, half of it above. Two are compared.
+    """
+    eps = torch.finfo(dtype).eps
+    return 2 * (errors + torch.where(best < 1, eps / 4, eps / 2) + SLACK)
 
 
 def block_maxima(queries: Tensor, block: Tensor) -> Tensor:
