@@ -19,14 +19,13 @@ import numpy as np
 
 from bench.errors import UserError
 from bench.kernels.search import unit_rows
-from bench.kernels.sharing import Company, company
+from bench.kernels.sharing import company, nearest_that_meet
 from bench.kernels.subspaces import Doubles, feet_and_frames, nearest_to_subspaces
 from bench.plugin import Asset, Defense, DescriptorAttack, Extractor, View, leads_through_no_word, lifted
 from bench.public import Public
 from bench.types import Bytes, Floats, Indices, Knowledge, Subspaces
 
 BATCH = 64  # subspaces whose words are gathered at a time
-PAIRS = 1024  # meetings that are scored at a time
 TOUCHING = 1e-12  # a word that is nearer to D than this counts as so near
 
 
@@ -63,7 +62,7 @@ class Clustering(DescriptorAttack):
         d = candidates(release, z, found, distances, clusters)  # (N, k, D)
         shared = company(release, view.know(Knowledge.OTHER_RELEASES)(self.others), words, self.coverage)
         view.notes.append(shared.summary())
-        far = scores(d, shared)  # (N, k)
+        far = nearest_that_meet(d, shared)  # (N, k)
         met = np.isfinite(far).all(axis=1)  # (N,)
         best = np.where(met, far.argmax(axis=1), np.abs(d).sum(axis=2).argmin(axis=1))
         return unit_rows(d[np.arange(len(d)), best].astype(np.float32))
@@ -96,18 +95,6 @@ def clustered(rows: Floats, clusters: int) -> Indices:
         closeness[every, centre, number] = np.inf  # however rounding has it, no row is nearer to another centre than to itself
         centre = closeness[:, :, : number + 1].max(axis=2).argmin(axis=1)
     return closeness.argmax(axis=2)
-
-
-def scores(candidates: Doubles, shared: Company) -> Doubles:
-    """min_j dist(d̂_i, Q'_j) of each candidate; infinite where no Q'_j meets the subspace. (N, k, D) -> (N, k)"""
-    nearest = np.full(candidates.shape[:2], np.inf)
-    for start in range(0, len(shared.meetings), PAIRS):
-        pairs = shared.meetings.take(np.arange(start, min(start + PAIRS, len(shared.meetings))))
-        other = shared.subspaces.take(pairs.second)
-        offsets = candidates[pairs.first] - other.origins[:, None]  # (P, k, D)
-        outside = offsets - (offsets @ other.bases.transpose(0, 2, 1)) @ other.bases
-        np.minimum.at(nearest, pairs.first, np.linalg.norm(outside, axis=2))
-    return nearest
 
 
 PLUGIN = Clustering

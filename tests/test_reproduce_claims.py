@@ -10,6 +10,7 @@ import pytest
 from scipy import stats
 
 from bench.features.sift import Sift
+from bench.public import Public
 from leaderboard.reproduce import scale, tables
 from leaderboard.reproduce.claims import (
     FEWEST,
@@ -26,8 +27,10 @@ from leaderboard.reproduce.claims import (
 from leaderboard.reproduce.intervals import RESAMPLES, interval, rank_correlation
 from leaderboard.reproduce.profiles import CPU, PROFILES, Materials, Setting
 from leaderboard.reproduce.study import printed
+from leaderboard.reproduce.tables import table4
 
 A, B = ("a", "ssim"), ("b", "ssim")
+SETTING = Setting(profile=CPU, materials=Materials(), extractor=Sift(), photographs=7)
 
 
 # ---- intervals
@@ -49,7 +52,7 @@ def test_interval_is_that_of_all_resamples(rng: np.random.Generator) -> None:
 
 
 def test_intervals_cover_the_mean_about_as_often_as_they_say(rng: np.random.Generator) -> None:
-    found = [interval(sample) for sample in rng.normal(size=(200, 40))]
+    found = [interval(sample) for sample in rng.normal(size=(100, 40))]
     assert 0.88 < np.mean([one.low < 0 < one.high for one in found]) < 0.99
 
 
@@ -162,8 +165,7 @@ def test_same_order_is_asked_of_the_pairs_that_are_far_enough_apart() -> None:
 def test_the_paper_keeps_its_own_claims(name: str) -> None:
     """Had each photograph the paper's values, every claim would hold; were all values negated, none that has a direction."""
     table = tables.everything()[name]
-    setting = Setting(profile=CPU, materials=Materials(), extractor=Sift(), photographs=7)
-    rows = (*table.rows(setting), *table.borrowed(setting))
+    rows = (*table.rows(SETTING), *table.borrowed(SETTING))
     assert len({row.name for row in rows}) == len(rows)
     values = printed(rows)
     claims = table.claims(values)
@@ -187,3 +189,14 @@ def test_the_scale_keeps_the_chance_of_the_truth(factor: float, words: int, epsi
     if factor != 1:  # the controls: without the shift, and with the shift to the wrong side
         for wrong in (epsilon, epsilon - math.log(factor)):
             assert chance(scale.words(words, factor), wrong) != pytest.approx(chance(words, epsilon), rel=1e-3)
+
+
+def test_the_defenses_of_table_4_tell_the_truth_as_often_as_the_papers() -> None:
+    public = Public()
+    for row in table4.rows(SETTING):
+        words, epsilon, subset = (float(row.labels[column].replace(",", "")) for column in ("|K|", "ε", "m"))
+        privacy = row.defense.privacy(public)
+        expected = subset * math.exp(epsilon) / (subset * math.exp(epsilon) + words - subset)
+        assert privacy.log10_true is not None
+        assert 10**privacy.log10_true == pytest.approx(expected, rel=1e-4)
+        assert privacy.epsilon == pytest.approx(epsilon - math.log(2))

@@ -35,7 +35,7 @@ SMOKE = Profile(
     others=8,
     reduced={"others": 8},
 )
-CPU = Profile(name="cpu", photographs=20, builtin=None, pictures=3, scale=0.5, subspaces=20_000, others=1600)
+CPU = Profile(name="cpu", photographs=16, builtin=None, pictures=3, scale=0.5, subspaces=20_000, others=1600)
 PAPER = Profile(name="paper", photographs=1_000_000, builtin=None, pictures=10, scale=1.0, subspaces=100_000, others=1600)
 PROFILES = {profile.name: profile for profile in (SMOKE, CPU, PAPER)}
 
