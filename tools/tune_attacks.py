@@ -19,11 +19,12 @@ from typing import Any
 
 import numpy as np
 
-from attacks.database import Database, closeness, estimate
+from attacks.database import Database
 from bench import registry, spec
 from bench.datasets import photographs
 from bench.errors import UserError
 from bench.features.sift import Sift
+from bench.kernels.estimates import estimate
 from bench.kernels.subspaces import nearest_to_subspaces
 from bench.plugin import DescriptorAttack, Lifting, View
 from bench.progress import Progress
@@ -70,11 +71,9 @@ def recover_by_database(seen: View, settings: Sequence[Database]) -> Iterator[Fl
     words, adversarial = seen.know(Knowledge.DATABASE).words, defense.adversarial
     most = max(attack.neighbours for attack in settings)
     found, distances = nearest_to_subspaces(release, words, adversarial + most)
-    v, distances = found[:, adversarial:], distances[:, adversarial:]
-    close = closeness(words, v, found[:, :adversarial])
     for attack in settings:
-        few = slice(attack.neighbours)
-        yield estimate(release, words, v[:, few], distances[:, few], close[:, few], attack.estimators)
+        few = slice(adversarial + attack.neighbours)
+        yield estimate(release, words, found[:, few], distances[:, few], adversarial, attack.estimators)
 
 
 TUNINGS = (
