@@ -220,7 +220,12 @@ def _label(configuration: Configuration, *, digests: bool = False) -> str:
 
 
 def _telling(value: Any) -> bool:
-    return not isinstance(value, dict) and value is not None and not str(value).startswith(("sha256:", "shipped"))
+    return (
+        not isinstance(value, dict)
+        and value is not None
+        and value is not False
+        and not str(value).startswith(("sha256:", "shipped"))
+    )
 
 
 def _short(value: Any) -> str:
