@@ -91,7 +91,7 @@ def main() -> None:
     names = [tuning.attack.name() for tuning in TUNINGS]
     parser.add_argument("--data", type=Path, required=True, help="the folder of tune.txt and train/")
     parser.add_argument("--attack", choices=names, action="append", help="one to tune, may be repeated; all by default")
-    parser.add_argument("--keypoints", type=int, default=25, help="of each photograph")
+    parser.add_argument("--keypoints", type=int, default=15, help="of each photograph")
     args = parser.parse_args()
     photos = [args.data / "train" / name for name in (args.data / "tune.txt").read_text().split()]
     for tuning in TUNINGS:

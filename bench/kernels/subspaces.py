@@ -23,8 +23,8 @@ Doubles = NDArray[np.float64]
 
 BLOCK = 2048  # words in a block
 ROWS = 1024  # rows of B and p that share one reading of the words: a block of products stays near the processor
-GROUP = 32  # words that are looked at one by one only if the best of them may count
-SCORES = 2**23  # scores that may wait for it to be known which of them can count
+GROUP = 32  # words, at most, that are looked at one by one only if the best of them may count
+GROUPS = 32  # for each word that is asked for, at least, if there are as many words
 NEAR = 1024  # words asked for, of several subspaces, that float64 decides on together
 FAR = 1e9  # the distance of no word
 TIE = 1e-12  # distances that differ by less count as equal; float64 errs by about 1e-16
@@ -47,7 +47,7 @@ def nearest_to_subspaces(release: Subspaces, words: Bytes | Floats, count: int =
     feet, frames = feet_and_frames(release)
     found = np.empty((len(release), count), dtype=np.int64)
     distances = np.empty((len(release), count))
-    step = max(1, min(ROWS // (release.dim + 1), SCORES // (count * GROUP)))
+    step = max(1, ROWS // (release.dim + 1))
     for start in range(0, len(release), step):
         batch = slice(start, start + step)
         rows, near = _possible(feet[batch], frames[batch], words, count)
@@ -85,20 +85,21 @@ def _possible(feet: Doubles, frames: Doubles, words: Bytes | Floats, count: int)
     coarse = torch.from_numpy(exact).to(dtype)
     error = _error(exact, coarse.double().numpy(), dtype, words.dtype)  # (n,)
     planes, allowed = coarse.to(device), torch.from_numpy(2 * error).float().to(device)[:, None]
+    size = max(1, min(GROUP, len(words) // (GROUPS * count)))
     # The highest scores of the words so far, no two of one group: the lowest of them bounds the count-th highest from below.
     best = torch.full((len(feet), count), torch.finfo(torch.float32).min, device=device)
     waiting, pairs = [], []
     for start in range(0, len(words), BLOCK):
         scores = _scores(planes, torch.from_numpy(words[start : start + BLOCK]).to(device))  # (n, K')
-        ragged = -scores.shape[1] % GROUP
+        ragged = -scores.shape[1] % size
         if ragged:
             scores = torch.nn.functional.pad(scores, (0, ragged), value=-torch.inf)
-        groups = scores.view(len(feet), GROUP, -1)  # (n, 32, G)
+        groups = scores.view(len(feet), size, -1)  # (n, size, G)
         waiting.append((start, groups, groups.amax(dim=1)))
-        if sum(maxima.shape[1] for _, _, maxima in waiting) < count and start + BLOCK < len(words):
+        if sum(maxima.shape[1] for _, _, maxima in waiting) < 2 * count and start + BLOCK < len(words):
             continue
-        best = torch.cat([best, *(maxima for _, _, maxima in waiting)], dim=1).topk(count, dim=1).values
-        least = best[:, -1:] - allowed  # (n, 1)
+        best = torch.cat([best, *(maxima for _, _, maxima in waiting)], dim=1).topk(count, dim=1, sorted=False).values
+        least = best.amin(dim=1, keepdim=True) - allowed  # (n, 1)
         pairs += [_at_least(least, *block) for block in waiting]
         waiting = []
     rows, near, found = (torch.cat(part) for part in zip(*pairs, strict=True))
@@ -108,9 +109,9 @@ def _possible(feet: Doubles, frames: Doubles, words: Bytes | Floats, count: int)
 
 
 def _at_least(least: Tensor, start: int, groups: Tensor, maxima: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The words of a block that score enough: subspace, word, score. (n, 1), start, (n, 32, G), (n, G) -> (P,) thrice"""
+    """The words of a block that score enough: subspace, word, score. (n, 1), start, (n, size, G), (n, G) -> (P,) thrice"""
     row, group = (maxima >= least).nonzero(as_tuple=True)
-    members = groups[row, :, group]  # (S, 32)
+    members = groups[row, :, group]  # (S, size)
     hit, place = (members >= least[row]).nonzero(as_tuple=True)
     return row[hit], start + place * groups.shape[2] + group[hit], members[hit, place]
 
