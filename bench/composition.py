@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import cache
+from functools import lru_cache
 
 import numpy as np
 from scipy.optimize import brentq
@@ -25,7 +25,7 @@ def basic(epsilon: float, answers: int) -> float:
     return answers * epsilon if answers else 0.0
 
 
-@cache
+@lru_cache(maxsize=4096)
 def optimal(epsilon: float, answers: int, delta: float = DELTA) -> float:
     """The least ε' such that `answers` answers, each ε-LDP, are together (ε', δ)-LDP, whatever they are.
 

@@ -21,7 +21,7 @@ from __future__ import annotations
 import math
 from decimal import MAX_EMAX, MIN_EMIN, ROUND_CEILING, ROUND_FLOOR, ROUND_HALF_EVEN, Context, Decimal
 from fractions import Fraction
-from functools import cache
+from functools import lru_cache
 from itertools import count
 
 import numpy as np
@@ -43,7 +43,7 @@ def chance_digits(epsilon: float, domain: int, size: int, bits: int) -> int:
     return 1 << bits if _is_certain(epsilon, domain, size) else _digits(exact(epsilon), domain, size, bits)
 
 
-@cache
+@lru_cache(maxsize=1024)
 def _digits(power: Fraction, domain: int, size: int, bits: int) -> int:
     rest = domain - size
     if power == 0:
@@ -163,8 +163,8 @@ def draw_distinct(rows: int, domain: int, size: int, rng: np.random.Generator) -
 def word_subsets(true: Indices, domain: int, epsilon: float, size: int, rng: np.random.Generator) -> Indices:
     """The ω-subset mechanism on K = {0, ..., domain − 1}. true: (N,) -> (N, m), rows ascending
 
-    Where repetitions are rare, words are drawn one by one, and only sets with a repetition anew and without. A set is accepted
-    whichever its words are, so both kinds have the law of the theorem, and what this costs does not depend on |K|.
+    Where repetitions are rare, words are drawn one by one, and only the sets that repeat one are drawn anew, without. Sets of
+    distinct words are equally likely to pass, so that both kinds have the law of the theorem; the cost does not depend on |K|.
     """
     told = draw_told(len(true), epsilon, domain, size, rng)
     if size * size > domain or domain == 1:
@@ -178,8 +178,9 @@ def word_subsets(true: Indices, domain: int, epsilon: float, size: int, rng: np.
 def _one_by_one(true: Indices, told: NDArray[np.bool_], domain: int, size: int, rng: np.random.Generator) -> Indices:
     """Words other than v, and v in the place of the first where u = 1. (N,), (N,) -> (N, m), rows ascending"""
     words = np.empty((len(true), size), dtype=np.int64)
-    for start in range(0, len(true), STEP // size):
-        rows = slice(start, start + STEP // size)
+    step = max(1, STEP // size)
+    for start in range(0, len(true), step):
+        rows = slice(start, start + step)
         drawn = rng.integers(domain - 1, size=(size, len(true[rows])))  # (m, n) of the |K| − 1 that remain
         drawn += drawn >= true[rows]
         np.copyto(drawn[0], true[rows], where=told[rows])
