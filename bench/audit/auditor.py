@@ -43,7 +43,7 @@ from bench.types import Features
 TIGHT = 0.9  # of the claimed ε, from which on a bound is called tight
 PLACES = 500  # pairs of keypoints in a call
 CALLS = 400  # at least, where there are so many trials
-DEVICES = 10_000  # the same, of a defense that remembers: each call is another device
+DEVICES = 4000  # the same, of a defense that remembers: each call is another device
 PILOTS = 20  # calls that choose what to look for; they are not counted
 ENUMERATED = 6  # words of a dictionary, at most, whose outputs are enumerated
 RUNS = 20_000  # of the enumeration, for each word
