@@ -60,7 +60,7 @@ def execute(args: argparse.Namespace) -> int:
     out = args.out or Path("runs") / _run_name(plan)
     records: list[Record] = []
     noted: set[str] = set()
-    with Progress(f"{len(plan.sources)} photographs, {len(plan.cells)} pairs", len(plan)) as progress:
+    with Progress(f"{len(plan.units)} photographs, {len(plan.cells)} pairs", len(plan)) as progress:
         for record in runner.execute(plan, out):
             records.append(record)
             progress.advance(note=record["unit"])
@@ -70,7 +70,7 @@ def execute(args: argparse.Namespace) -> int:
             noted.update(record["notes"])
             if record["status"] == "failed":
                 progress.say(f"bench: failed: {record['unit']}, {record['defense']['name']}: {record['reason']}")
-    report.write(records, plan.sources, out)
+    report.write(records, plan.units, out)
     _print_records(records) if args.json else _print_tables(records)
     say(DONE, f"written to {out}")
     return FAILED if any(record["status"] == "failed" for record in records) else DONE
