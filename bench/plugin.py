@@ -327,6 +327,7 @@ class Task(Plugin, ABC):
     """What a release is judged by. The runner plans, resumes and records; a task does one trial at a time."""
 
     attacked: ClassVar[bool]  # whether it judges what an attack makes of the release, and not the release itself
+    places: ClassVar[bool] = False  # whether it is about a place, even if none is named
 
     @abstractmethod
     def collection(self, images: Images, dataset: Dataset | None) -> Collection:

@@ -13,7 +13,7 @@ import itertools
 import logging
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from bench import composition, environment, records, registry, spec, units
+from bench import composition, environment, pool, records, registry, spec, units
 from bench.datasets.photographs import Source
 from bench.errors import PluginError, UnitError, UserError, blamed
 from bench.features import kept
@@ -50,10 +50,23 @@ class Cell:
     reason: str | None  # why it does not apply, if it does not
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Asked:
+    """What a plan is made from. Can be pickled, so that other processes make the same plan."""
+
+    pairs: tuple[tuple[Defense, Attack | None], ...]
+    images: Images
+    task: Task
+    extractor: Extractor
+    dataset: Dataset | None
+    seed: int
+
+
 @dataclass(frozen=True, eq=False)
 class Plan:
     """Everything that a run will do, checked as far as it can be without doing it."""
 
+    asked: Asked
     task: Task
     cells: tuple[Cell, ...]
     units: tuple[Unit, ...]
@@ -150,8 +163,22 @@ def prepare_pairs(
     UserError
         as `prepare`.
     """
-    extractor = extractor or Sift()
-    collection = task.collection(images, dataset)
+    asked = Asked(pairs=tuple(pairs), images=images, task=task, extractor=extractor or Sift(), dataset=dataset, seed=seed)
+    plan = planned(asked)
+    _rehearse(plan)
+    return plan
+
+
+def planned(asked: Asked) -> Plan:
+    """The plan, before anything was tried.
+
+    Raises
+    ------
+    UserError
+        if something is wrong with what was asked, or no pair of it applies.
+    """
+    task, extractor, dataset, seed = asked.task, asked.extractor, asked.dataset, asked.seed
+    collection = task.collection(asked.images, dataset)
     hashes = {unit.name: unit.content_hash() for unit in collection.units}
     public = Public(place=None if collection.scene is None else Place(collection.scene, extractor))
     judged = {
@@ -162,12 +189,12 @@ def prepare_pairs(
     }
     metrics = tuple(metric() for metric in registry.everything(registry.METRIC)) if task.attacked else ()
     settings = {metric.name(): _settings(metric) for metric in metrics}
-    taking_part = [plugin for pair in pairs for plugin in pair if plugin is not None]
+    taking_part = [plugin for pair in asked.pairs for plugin in pair if plugin is not None]
     ran = environment.describe([task, extractor, *taking_part, *metrics])
     sources = [image for unit in collection.units for image in unit.images if isinstance(image, Source)]
     populations: dict[Defense, Population] = {}
     cells = []
-    for defense, attack in pairs:
+    for defense, attack in asked.pairs:
         protected = spec.configuration(defense, public)
         if defense not in populations:
             drawn = functools.partial(randomness, "population", seed, protected, judged["extractor"])
@@ -188,13 +215,15 @@ def prepare_pairs(
     if all(cell.reason for cell in cells):
         raise UserError("nothing to run: " + "; ".join(sorted({str(cell.reason) for cell in cells})))
     unique = {cell.head["cell_id"]: cell for cell in cells}  # one that was asked for twice is done once
-    plan = Plan(task, tuple(unique.values()), collection.units, hashes, extractor, metrics, public, seed)
-    _rehearse(plan)
-    return plan
+    return Plan(asked, task, tuple(unique.values()), collection.units, hashes, extractor, metrics, public, seed)
 
 
-def execute(plan: Plan, out: Path | None = None) -> Iterator[Record]:
-    """Do what was planned and yield its records, those that `out` holds already included.
+def execute(plan: Plan, out: Path | None = None, workers: int = 1) -> Iterator[Record]:
+    """Do what was planned and yield its records, those that `out` holds already included, always in the same order.
+
+    Parameters
+    ----------
+    workers : processes that do it; of more than one each does whole units
 
     Raises
     ------
@@ -203,8 +232,9 @@ def execute(plan: Plan, out: Path | None = None) -> Iterator[Record]:
     OSError
         if the disk is full; every record yielded so far is kept.
     """
+    maker = _alone if workers <= 1 else functools.partial(pool.units, workers=workers)
     if out is None:
-        yield from (record for record, _ in _executed(plan, {}, None))
+        yield from (record for record, _ in _executed(plan, {}, functools.partial(maker, plan, None)))
         return
     file = out / records.FILE
     before = records.read(file) if file.is_file() else records.Contents([], 0)
@@ -212,7 +242,7 @@ def execute(plan: Plan, out: Path | None = None) -> Iterator[Record]:
         logging.getLogger(__name__).warning(before.notice)
     done = {(record["run_hash"], record["unit"]): record for record in before.records if record["status"] != "failed"}
     with records.Log(file) as log:
-        for record, fresh in _executed(plan, done, out):
+        for record, fresh in _executed(plan, done, functools.partial(maker, plan, out)):
             if fresh:
                 log.append(record)
             yield record
@@ -258,22 +288,30 @@ def _rehearse(plan: Plan) -> None:
         return
 
 
-def _executed(plan: Plan, done: Mapping[tuple[str, str], Record], out: Path | None) -> Iterator[tuple[Record, bool]]:
+Work = tuple[Unit, Sequence[Cell]]
+
+
+def _executed(
+    plan: Plan, done: Mapping[tuple[str, str], Record], make: Callable[[Sequence[Work]], Iterator[Iterable[Record]]]
+) -> Iterator[tuple[Record, bool]]:
     """All records in order, and whether each was made just now. What holds for every unit comes with the first."""
-    cells = plan.cells
-    for unit in plan.units:
-        names = [unit.name if cell.reason is None else EVERY_UNIT for cell in cells]
-        known = [done.get((cell.head["run_hash"], name)) for cell, name in zip(cells, names, strict=True)]
-        left = [cell for cell, earlier in zip(cells, known, strict=True) if earlier is None and cell.reason is None]
-        fresh = _records(plan, unit, left, out)
-        for cell, earlier in zip(cells, known, strict=True):
-            if earlier is not None:
+    applicable = [cell for cell in plan.cells if cell.reason is None]
+    left = [(unit, [cell for cell in applicable if (cell.head["run_hash"], unit.name) not in done]) for unit in plan.units]
+    for place, ((unit, _), made) in enumerate(zip(left, make(left), strict=True)):
+        fresh = iter(made)
+        for cell in applicable if place else plan.cells:
+            name = unit.name if cell.reason is None else EVERY_UNIT
+            if (earlier := done.get((cell.head["run_hash"], name))) is not None:
                 yield earlier, False
             elif cell.reason is not None:
                 yield _record(cell, None, status="n/a", reason=cell.reason), True
             else:
                 yield next(fresh), True
-        cells = tuple(cell for cell in cells if cell.reason is None)
+
+
+def _alone(plan: Plan, out: Path | None, work: Sequence[Work]) -> Iterator[Iterable[Record]]:
+    """Do it here, each record when it is asked for."""
+    return (unit_records(plan, unit, cells, out) for unit, cells in work)
 
 
 @dataclass(frozen=True, eq=False)
@@ -286,7 +324,7 @@ class _Observed:
     notes: tuple[str, ...]
 
 
-def _records(plan: Plan, unit: Unit, cells: Sequence[Cell], out: Path | None) -> Iterator[Record]:
+def unit_records(plan: Plan, unit: Unit, cells: Sequence[Cell], out: Path | None) -> Iterator[Record]:
     """Read and extract one unit, protect it once by each defense, and let every attack at it."""
     if not cells:
         return
