@@ -85,33 +85,29 @@ def joined(parts: Sequence[Meetings]) -> Meetings:
 
 def _screened(one: Subspaces, other: Subspaces, triangle: bool = False) -> Iterator[tuple[Indices, Indices]]:
     """Pairs that may meet, block by block; `triangle` leaves out blocks of which each pair has `first` > `second`."""
-    for rows, columns, squares in blocks(one, other, one.dim + other.dim + SPARE, triangle):
-        first, second = (squares < NEAR).nonzero(as_tuple=True)
-        yield first.cpu().numpy() + rows.start, second.cpu().numpy() + columns.start
-
-
-def blocks(one: Subspaces, other: Subspaces, count: int, triangle: bool = False) -> Iterator[tuple[slice, slice, Tensor]]:
-    """Squared distances of all pairs in a projection onto `count` directions, block by block: rows, columns, and (n, n').
-
-    In all D directions they are the subspaces' own, to about 2e-5. `triangle` leaves out blocks of which each pair has
-    `first` > `second`.
-
-    Raises
-    ------
-    UserError
-        if the dimensions add up to D or more, where all pairs meet.
-    """
     length = one.origins.shape[1]
     if one.dim + other.dim >= length:
         raise UserError(f"subspaces of dimensions {one.dim} and {other.dim} always meet in a space of {length}")
+    for top, left, squares in squared_distances(one, other, one.dim + other.dim + SPARE, triangle):
+        first, second = (squares < NEAR).nonzero(as_tuple=True)
+        yield first.cpu().numpy() + top, second.cpu().numpy() + left
+
+
+def squared_distances(
+    one: Subspaces, other: Subspaces, directions: int, triangle: bool = False
+) -> Iterator[tuple[int, int, Tensor]]:
+    """dist² of all pairs, block by block, after a projection onto so many fixed directions; onto D of them it changes nothing.
+
+    Returns
+    -------
+    The first row, the first column and (n, n') float32 of each block; `triangle` leaves out those below the diagonal.
+    """
     device = pick_device()
-    mine, theirs = (_projected(release, count).to(device) for release in (one, other))  # (dim + 1, N, count)
-    width = max(1, BLOCK // ((other.dim + 1) ** 2 * ROWS))
+    mine, theirs = (_projected(release, directions).to(device) for release in (one, other))  # (dim + 1, N, k)
+    columns = max(1, BLOCK // ((other.dim + 1) ** 2 * ROWS))
     for top in range(0, len(one), ROWS):
-        rows = slice(top, top + ROWS)
-        for left in range(top // width * width if triangle else 0, len(other), width):
-            columns = slice(left, left + width)
-            yield rows, columns, _squared_distances(mine[:, rows], theirs[:, columns])
+        for left in range(top // columns * columns if triangle else 0, len(other), columns):
+            yield top, left, _squared_distances(mine[:, top : top + ROWS], theirs[:, left : left + columns])
 
 
 def _projected(release: Subspaces, count: int) -> Tensor:
