@@ -1,4 +1,4 @@
-"""A place as its server has it: the features of its reference images, the map made of them, and dictionaries clustered from them."""
+"""A place as its server has it: features of its reference images, and the map and the dictionaries that are made of them."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Place:
     def words(self, known: Dictionary) -> Indices:
         """What the map's keypoints quantise to. -> (T,)"""
         if known.digest not in self._words:
-            self._words[known.digest] = known.index.nearest(self.map.stored)
+            self._words[known.digest] = known.index.nearest(self.map.descriptors if self.map.codes is None else self.map.codes)
         return self._words[known.digest]
 
     def bags(self, known: Dictionary) -> Bags:

@@ -80,7 +80,7 @@ class Server:
         return Localized(correspondences=found, estimate=estimate)
 
     def misfit(self, query: Features) -> float | None:
-        """The focal length that a query's raw features ask for, relative to the camera's, if they leave no doubt it is another."""
+        """The focal length that a query's raw features ask for, relative to the camera's, if it is another beyond doubt."""
         raw = Descriptors(keypoints=query.keypoints, size=query.size, descriptors=query.descriptors)
         found = self.localize(raw, None, self.seen_by(query), "mutual-nn", CHECKED, seed=0)
         if found.estimate is None:
@@ -92,7 +92,7 @@ class Server:
         return release.keypoints[found.keypoints].astype(np.float64), self.place.map.xyz[found.points]
 
     def _alike(self, descriptors: Bytes | Floats, count: int) -> Indices:
-        known = self.public.dictionary(REFERENCES, min(VOCABULARY, len(self.place.map.stored) // 4))
+        known = self.public.dictionary(REFERENCES, min(VOCABULARY, len(self.place.map.keypoints) // 4))
         return self.place.bags(known).rank(known.index.nearest(descriptors), count)
 
 

@@ -96,7 +96,7 @@ class Localization(Task):
 
 
 def _check(server: Server, secret: Features, query: str) -> None:
-    """Raise UnitError if the intrinsics are wrong; found out once, by raw features, so that all defenses have the same queries."""
+    """Raise UnitError if the intrinsics are wrong; found out by raw features, so that all defenses have the same queries."""
     known = server.place.misfits
     if query not in known:
         known[query] = server.misfit(secret)
