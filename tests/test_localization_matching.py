@@ -16,7 +16,7 @@ from bench.types import Descriptors, Indices, Release, Subspaces, WordSets
 from defenses.affine import Affine
 from defenses.ldp import LDP
 from defenses.naive_ldp import NaiveLDP
-from defenses.none import PLUGIN as Raw
+from defenses.none import Undefended
 
 WORDS = 12
 
@@ -144,7 +144,7 @@ def test_nothing_retrieved_matches_nothing(seen: Map, rng: np.random.Generator, 
 
 def test_matcher_is_chosen_by_type() -> None:
     chosen: dict[Defense, str] = {
-        Raw(): "mutual-nn",
+        Undefended(): "mutual-nn",
         LDP(): "vocabulary",
         NaiveLDP(): "mutual-nn",
         Affine(): "point-to-subspace",
