@@ -143,8 +143,8 @@ TUNINGS = (
     ),
     Tuning(
         attack=Intersection,
-        grid={"neighbours": (512, 1024, 2048, 4096), "estimators": (1, 2, 4, 8), "others": (200, 800)},
-        photographs=8,
+        grid={"neighbours": (512, 1024, 2048, 4096), "estimators": (1, 2, 4, 8)},
+        photographs=4,
         keypoints=None,
         recover=recover_by_intersection,
     ),
