@@ -89,8 +89,8 @@ def heading(study: Study) -> str:
     return (
         "# What a release leaks by how it is written\n\n"
         f"Written by `tools/leakage.py`. All networks have half the channels of the shipped ones ({WIDTHS}) and are trained on "
-        f"the same {study.trained_on} photographs, in batches of 8 crops. **That is a small budget**: read the differences between "
-        "networks that were trained equally long, not how well any of them paints; and a difference may grow, or vanish, with "
+        f"the same {study.trained_on} photographs, in batches of 8 crops. **That is a small budget**: read differences between "
+        "networks that were trained equally long, not how well any of them paints; a difference may grow, or vanish, with "
         "longer training. In brackets: 95% bootstrap over photographs, the 100 of `test.txt` and the 7 built-in ones, which no "
         "network was trained or chosen on. Differences are of the same photographs; *leaks more* is said where the interval on "
         "`test.txt` lies above 0.\n"
