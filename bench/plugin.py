@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, final
 
 import numpy as np
@@ -14,8 +14,9 @@ from bench.types import Bytes, Features, Floats, Indices, Knowledge, Release, Su
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from bench.datasets.scene import Scene
+    from bench.datasets.scene import Mask, Scene
     from bench.public import Public
+    from bench.units import Collection, Images, Unit
 
 
 class Asset(str):
@@ -179,7 +180,7 @@ def lifted(view: View) -> tuple[Subspaces, int]:
 
 
 class Attack(Plugin, ABC):
-    """Sees a `View` and tries to undo the defense. Subclass `DescriptorAttack` or `ImageAttack`."""
+    """Sees a `View` and tries to undo the defense. Subclass `DescriptorAttack`, `SelectiveAttack` or `ImageAttack`."""
 
     accepts: ClassVar[tuple[type[Release], ...]]
     needs: ClassVar[frozenset[Knowledge]] = frozenset()
@@ -213,6 +214,28 @@ class DescriptorAttack(Attack):
         """Return (N, D) float32 unit-norm estimates, in the order of the release's keypoints."""
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Selection:
+    """Descriptors of some of a release's keypoints."""
+
+    rows: Indices  # (R,) of the release
+    descriptors: Floats  # (R, D) unit norm
+
+
+class SelectiveAttack(Attack):
+    """Recovers descriptors where it can. Images are made of those keypoints alone, by the network for raw descriptors."""
+
+    @abstractmethod
+    def select(self, view: View, rng: np.random.Generator) -> Selection:
+        """Return the keypoints that it is sure of, and float32 estimates of their descriptors.
+
+        Raises
+        ------
+        UnitError
+            if there is none.
+        """
+
+
 class ImageAttack(Attack):
     """Recovers the photograph itself."""
 
@@ -234,6 +257,16 @@ class Metric(Plugin, ABC):
     @abstractmethod
     def __call__(self, truth: Floats, estimate: Floats) -> float | None:
         """Images are (H, W, 3) in [0, 1]; descriptors are (N, D). None where the value is not finite."""
+
+
+class LocalMetric(Metric):
+    """A metric of images that can be told for each pixel, so that parts of an image can be compared."""
+
+    compares = "images"
+
+    @abstractmethod
+    def local(self, truth: Floats, estimate: Floats) -> Floats:
+        """(H, W, 3) twice -> (H, W), the mean over channels."""
 
 
 class Dataset(Plugin, ABC):
@@ -271,12 +304,21 @@ class Extractor(Plugin, ABC):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Shot:
+    """One image of a unit: what only its owner has, and what was released of it."""
+
+    pixels: Callable[[], Bytes]  # (H, W, 3); read when it is asked for
+    secret: Features
+    release: Release
+    foreground: Callable[[], Mask | None] = lambda: None  # (H, W) where something hides the scene that moves, if that is known
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Trial:
     """One unit of one cell of the experiment: the truth, what was released of it, and who attacks."""
 
-    pixels: Bytes  # (H, W, 3) the photograph
-    secret: Features
-    release: Release
+    unit: Unit
+    shots: tuple[Shot, ...]  # one for each image of the unit
     defense: Defense
     attack: Attack | None  # None where the task judges the release itself
     extractor: Extractor
@@ -284,7 +326,25 @@ class Trial:
     metrics: tuple[Metric, ...]
     rng: np.random.Generator
     others: Callable[[int], Iterator[Release]]  # the first so many releases of other photographs
-    repeats: tuple[Release, ...]  # further releases of the same features
+    repeats: tuple[Release, ...]  # further releases of the first image's features
+
+    @property
+    def secret(self) -> Features:
+        """Of the unit's first image, for most the only one."""
+        return self.shots[0].secret
+
+    @property
+    def release(self) -> Release:
+        """Of the unit's first image, for most the only one."""
+        return self.shots[0].release
+
+    def pixels(self) -> Bytes:
+        """(H, W, 3) of the unit's first image, for most the only one."""
+        return self.shots[0].pixels()
+
+    def released(self, release: Release) -> Trial:
+        """The same trial, had that been released of the unit's first image."""
+        return replace(self, shots=(replace(self.shots[0], release=release), *self.shots[1:]))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -300,6 +360,17 @@ class Task(Plugin, ABC):
     """What a release is judged by. The runner plans, resumes and records; a task does one trial at a time."""
 
     attacked: ClassVar[bool]  # whether it judges what an attack makes of the release, and not the release itself
+    places: ClassVar[bool] = False  # whether it is about a place, even if none is named
+
+    @abstractmethod
+    def collection(self, images: Images, dataset: Dataset | None) -> Collection:
+        """What there is to judge, given photographs or a place; the built-in ones where neither is given.
+
+        Raises
+        ------
+        UserError
+            if they are missing or damaged, or are not what this task judges.
+        """
 
     @abstractmethod
     def inapplicable(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> str | None:

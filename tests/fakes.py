@@ -13,10 +13,15 @@ from bench.datasets.scene import File, Reference, Scene, SceneImage
 from bench.features.sift import Sift
 from bench.plugin import Defense, Trial
 from bench.public import Public
+from bench.testing import NO_UNIT, shot
 from bench.types import Features, Release
 
 FAKES = {
-    "feature_privacy.attacks": {"painter": "fake_plugins.painter:PLUGIN", "guess": "fake_plugins.guess:PLUGIN"},
+    "feature_privacy.attacks": {
+        "painter": "fake_plugins.painter:PLUGIN",
+        "guess": "fake_plugins.guess:PLUGIN",
+        "glimpse": "fake_plugins.glimpse:PLUGIN",
+    },
     "feature_privacy.defenses": {"broken": "fake_plugins.broken:PLUGIN"},
 }
 
@@ -72,9 +77,8 @@ def trial(defense: Defense, secret: Features, *, rng: np.random.Generator | None
     """A trial of a task that judges the release itself, of features without a photograph."""
     public = Public()
     return Trial(
-        pixels=np.zeros((*secret.size[::-1], 3), dtype=np.uint8),
-        secret=secret,
-        release=defense.protect(secret, public, np.random.default_rng(1)),
+        unit=NO_UNIT,
+        shots=(shot(secret, defense.protect(secret, public, np.random.default_rng(1))),),
         defense=defense,
         attack=None,
         extractor=Sift(),
