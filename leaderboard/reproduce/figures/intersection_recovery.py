@@ -61,7 +61,7 @@ def drawn(scene: Scene) -> Iterator[tuple[str, Figure]]:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9.6, 3.9), layout="constrained", dpi=120)
-    photographs = len(scene.photographs.chosen)
+    photographs = len(scene.judged.chosen)
     figure.suptitle(f"The intersection attack, which knows no database; mean over {photographs} photographs", fontsize=9)
     shares, pictures = figure.subplots(1, 2)
     for number, dim in enumerate(table1.DIMS):
