@@ -13,7 +13,7 @@ import pytest
 from fake_plugins.painter import Painter
 from fakes import FAKES, album, install
 
-from bench import cli, registry
+from bench import cli, registry, terminal
 from bench.datasets import colmap
 from bench.datasets.gallery import Gallery
 from bench.plugin import View
@@ -212,7 +212,7 @@ def test_closed_pipe_is_no_error() -> None:
         [sys.executable, "-m", "bench.cli", "list", "metrics"], stdout=writing, stderr=subprocess.PIPE, text=True
     )
     os.close(writing)
-    assert ended.returncode == cli.BROKEN_PIPE
+    assert ended.returncode == terminal.BROKEN_PIPE
     assert "Traceback" not in ended.stderr
     assert "BrokenPipe" not in ended.stderr
 

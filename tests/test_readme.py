@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bench import registry, testing
-from bench.cli import _parser
+from bench.cli import parser
 from bench.public import Public
 
 README = (Path(__file__).resolve().parents[1] / "README.md").read_text(encoding="utf-8")
@@ -28,6 +28,6 @@ def test_the_defense_in_twenty_lines(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("line", re.findall(r"^(?:\.venv/bin/)?bench (.+?)(?:\s+#.*)?$", README, re.MULTILINE))
 def test_commands_are_understood(line):
-    args, extra = _parser().parse_known_args(line.split())
+    args, extra = parser().parse_known_args(line.split())
     assert not extra
     assert all(getattr(args, option) for option in args.required)

@@ -1,0 +1,55 @@
+"""`bench reproduce`: the paper's tables and figures beside ours."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from bench.terminal import DONE, FAILED, add_extractor, add_seed, print_rich, say
+
+SUMMARY = "rebuild a table of the paper, or its figures, beside the paper's"
+EPILOG = """Tables come with intervals over the photographs, and with a verdict on each claim of the paper.
+
+examples:
+  bench reproduce table1
+  bench reproduce table4 --images DIR --out runs/test
+  bench reproduce figures --profile smoke
+"""
+REQUIRED = ("what",)
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("what", nargs="?", metavar="NAME", help="table1, table4, tableS3, tableS4, figures, ...")
+    parser.add_argument("--profile", metavar="NAME", default="cpu", help="smoke, cpu or paper: the sizes (default: %(default)s)")
+    parser.add_argument("--images", type=Path, metavar="DIR", help="a folder of photographs (default: the built-in ones)")
+    add_extractor(parser)
+    add_seed(parser)
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="folder for the results; resumed if it exists (default: in runs/)"
+    )
+    parser.add_argument("--dictionary", metavar="FILE", help="K of LDP-Feat (default: the shipped one)")
+    parser.add_argument("--database", metavar="FILE", help="W of affine lifting (default: the shipped one)")
+    parser.add_argument("--public-database", metavar="FILE", help="Z, the attacker's own (default: the shipped one)")
+    for network, defense in (("raw", "none"), ("affine", "affine"), ("ldp", "ldp")):
+        parser.add_argument(
+            f"--{network}-network", metavar="FILE", help=f"weights trained for `{defense}` (default: shipped ones)"
+        )
+
+
+def execute(args: argparse.Namespace) -> int:
+    from bench import registry, spec
+    from leaderboard import reproduce
+
+    materials = {name: getattr(args, name) for name in reproduce.materials() if getattr(args, name)}
+    done = reproduce.reproduce(
+        args.what,
+        args.profile,
+        images=args.images,
+        extractor=spec.read(args.extractor, registry.EXTRACTOR),
+        seed=args.seed,
+        out=args.out,
+        materials=materials,
+    )
+    print_rich(*done.shown)
+    say(DONE, f"written to {done.out}")
+    return FAILED if done.failed else DONE

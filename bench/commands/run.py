@@ -1,0 +1,101 @@
+"""`bench run`: defenses against attacks, or judged for what a server can do with them."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from bench.errors import UserError
+from bench.terminal import DONE, FAILED, add_extractor, add_seed, print_rich, say
+
+if TYPE_CHECKING:
+    from bench.plugin import Task
+    from bench.records import Record
+    from bench.runner import Plan
+
+SUMMARY = "run defenses against attacks on photographs, and report what was recovered"
+EPILOG = """A plugin is written name:field=value,field=value; `bench list` shows names and fields.
+Repeated options make a grid.
+
+examples:
+  bench run --defense ldp --attack dia
+  bench run --defense none --defense ldp:epsilon=inf --attack dia --extractor sift:upright=false --images DIR --json
+"""
+REQUIRED = ("defense",)
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--defense", action="append", metavar="SPEC", help="what protects the features; may be repeated")
+    parser.add_argument("--attack", action="append", metavar="SPEC", help="who tries to undo it; may be repeated")
+    parser.add_argument(
+        "--task", metavar="SPEC", default="reconstruction", help="what a release is judged by (default: %(default)s)"
+    )
+    add_extractor(parser)
+    parser.add_argument("--images", type=Path, metavar="DIR", help="a folder of photographs (default: seven built-in ones)")
+    add_seed(parser)
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="folder for the results; resumed if it exists (default: in runs/)"
+    )
+    parser.add_argument("--json", action="store_true", help="print the records instead of the table")
+
+
+def execute(args: argparse.Namespace) -> int:
+    from bench import registry, runner, spec
+    from bench.progress import Progress
+    from leaderboard import report
+
+    task = spec.read(args.task, registry.TASK)
+    _check_attacks(task, args.attack)
+    plan = runner.prepare(
+        [spec.read(text, registry.DEFENSE) for text in args.defense],
+        [spec.read(text, registry.ATTACK) for text in args.attack or []],
+        args.images,
+        extractor=spec.read(args.extractor, registry.EXTRACTOR),
+        task=task,
+        seed=args.seed,
+    )
+    out = args.out or Path("runs") / _run_name(plan)
+    records: list[Record] = []
+    noted: set[str] = set()
+    with Progress(f"{len(plan.sources)} photographs, {len(plan.cells)} pairs", len(plan)) as progress:
+        for record in runner.execute(plan, out):
+            records.append(record)
+            progress.advance(note=record["unit"])
+            for note in record["notes"]:
+                if note not in noted:
+                    progress.say(f"bench: {note}")
+            noted.update(record["notes"])
+            if record["status"] == "failed":
+                progress.say(f"bench: failed: {record['unit']}, {record['defense']['name']}: {record['reason']}")
+    report.write(records, plan.sources, out)
+    _print_records(records) if args.json else _print_tables(records)
+    say(DONE, f"written to {out}")
+    return FAILED if any(record["status"] == "failed" for record in records) else DONE
+
+
+def _check_attacks(task: Task, attacks: list[str] | None) -> None:
+    if task.attacked and not attacks:
+        raise UserError(f"--attack is missing: the task {task.name()} judges what an attack recovers (bench list attacks)")
+    if attacks and not task.attacked:
+        raise UserError(f"--attack: the task {task.name()} judges the release itself and takes none")
+
+
+def _run_name(plan: Plan) -> str:
+    """The defenses' and attacks' names, and eight digits that tell configurations apart."""
+    defenses = dict.fromkeys(cell.defense.name() for cell in plan.cells)
+    attacks = dict.fromkeys(cell.attack.name() if cell.attack else plan.task.name() for cell in plan.cells)
+    return f"{'+'.join(defenses)[:60]}-{'+'.join(attacks)[:60]}-{plan.hash[:8]}"
+
+
+def _print_records(records: list[Record]) -> None:
+    for record in records:
+        print(json.dumps(record, allow_nan=False))
+
+
+def _print_tables(records: list[Record]) -> None:
+    from leaderboard import tables
+
+    print_rich(*(tables.to_rich(table, foldable=sys.stdout.isatty()) for table in tables.tables(records)))

@@ -1,0 +1,71 @@
+"""`bench train`: the attacker's inversion network for a defense's releases."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from bench.terminal import DONE, add_extractor, add_seed, whole, wholes
+
+SUMMARY = "train, or resume, the attacker's inversion network for a defense's releases"
+REQUIRED = ("defense", "images", "out")
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--defense", metavar="SPEC", help="fields given are fixed; of the others the network serves all settings")
+    parser.add_argument("--images", type=Path, metavar="DIR", help="a folder of photographs")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="the network's weights, a safetensors file")
+    parser.add_argument(
+        "--validation",
+        type=Path,
+        metavar="DIR|LIST",
+        help="a folder, or a file of names in --images to hold out (default: every 20th)",
+    )
+    parser.add_argument(
+        "--crossfit",
+        action="append",
+        default=[],
+        metavar="FILE",
+        help="a dictionary that quantises photographs which the defense's own was made from; may be repeated",
+    )
+    parser.add_argument(
+        "--encoding",
+        choices=("invariant", "released", "positions"),
+        default="invariant",
+        help="what the network is told: the release without random order or basis, as it is, or positions alone",
+    )
+    parser.add_argument("--widths", type=wholes, metavar="N,N,...", help="channels of the network's levels")
+    parser.add_argument("--start", type=Path, metavar="FILE", help="weights of a network for raw descriptors to start from")
+    parser.add_argument("--rate", type=float, metavar="R", help="the learning rate at its peak")
+    parser.add_argument("--steps", type=whole, metavar="N", help="steps of training")
+    parser.add_argument("--batch", type=whole, metavar="N", help="photographs a step")
+    add_seed(parser, "the training")
+    add_extractor(parser)
+
+
+def execute(args: argparse.Namespace) -> int:
+    from attacks.inversion.network import Shape
+    from attacks.inversion.train import Training, train
+    from bench import registry, spec
+    from bench.datasets.photographs import folder, held_out
+    from bench.plugin import Asset
+
+    plugin, given = spec.parse(args.defense, registry.DEFENSE)
+    photographs, validation = held_out(folder(args.images), args.validation)
+    chosen = {name: value for name in ("steps", "batch", "rate", "seed") if (value := getattr(args, name)) is not None}
+    meta = train(
+        spec.build(plugin, given),
+        {name: settings for name, settings in plugin.serves.items() if name not in given},
+        photographs=photographs,
+        validation=validation,
+        out=args.out,
+        extractor=spec.read(args.extractor, registry.EXTRACTOR),
+        crossfit=[Asset(file) for file in args.crossfit],
+        start=args.start,
+        encoding=args.encoding,
+        widths=args.widths or Shape.widths,
+        training=Training(**chosen),
+    )
+    scores = ", ".join(f"{name} {value:.4g}" for name, value in meta["validation"].items())
+    print(f"{args.out}: {meta['crops']} crops of {meta['photographs']} photographs; validation: {scores}")
+    return DONE

@@ -1,0 +1,72 @@
+"""What commands share: exit statuses, how options are read, and how things are printed."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterable
+
+from bench.errors import UserError
+
+DONE, FAILED, MISTAKE, INTERRUPTED = 0, 1, 2, 130
+BROKEN_PIPE = 141  # as a shell reports a program that SIGPIPE ended
+PIPED_WIDTH = 400  # columns of a table that goes to a file: its cells are not folded, so that they can be searched
+
+
+def require(args: argparse.Namespace, options: Iterable[str], command: str) -> None:
+    """Raise UserError if one of these options was not given."""
+    for option in options:
+        if getattr(args, option) in (None, ""):
+            raise UserError(f"--{option.replace('_', '-')} is missing (bench {command} --help explains)")
+
+
+def say(status: int, line: str) -> int:
+    """Print a line on stderr; returns the status."""
+    print(f"bench: {line}", file=sys.stderr, flush=True)
+    return status
+
+
+def print_rich(*items: object) -> None:
+    """Print what rich can draw."""
+    from rich.console import Console
+
+    console = Console(width=None if sys.stdout.isatty() else PIPED_WIDTH)
+    # Rich itself would answer a closed pipe with exit status 1, which is taken.
+    with console.capture() as captured:
+        for item in items:
+            console.print(item)
+    encoding = sys.stdout.encoding or "utf-8"
+    sys.stdout.write(captured.get().encode(encoding, "backslashreplace").decode(encoding))
+
+
+def whole(text: str) -> int:
+    """Read a whole number."""
+    try:
+        return int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected a whole number, not {text!r}") from None
+
+
+def wholes(text: str) -> tuple[int, ...]:
+    """Read whole numbers with commas between them."""
+    return tuple(whole(part) for part in text.split(","))
+
+
+def number(text: str) -> float:
+    """Read a number, exactly."""
+    from bench.exact import Exact
+
+    try:
+        return Exact(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected a number or a fraction, not {text!r}") from None
+
+
+def add_seed(parser: argparse.ArgumentParser, what: str = "everything random") -> None:
+    """Declare --seed."""
+    parser.add_argument("--seed", type=whole, default=0, metavar="N", help=f"of {what} (default: %(default)s)")
+
+
+def add_extractor(parser: argparse.ArgumentParser) -> None:
+    """Declare --extractor."""
+    parser.add_argument("--extractor", metavar="SPEC", default="sift", help="what makes the features (default: %(default)s)")
