@@ -1,4 +1,4 @@
-"""How sure a mean over photographs is: percentile bootstrap (Efron 1979)."""
+"""How sure a mean over photographs is: percentile bootstrap (Efron 1979); and a share of queries: Wilson's interval (1927)."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
+from scipy.stats import norm
 
 LEVEL = 0.95
 RESAMPLES = 10_000
@@ -37,6 +38,20 @@ def interval(values: ArrayLike) -> Interval:
     means = sample[drawn].mean(axis=1)  # (RESAMPLES,)
     low, high = np.quantile(means, ((1 - LEVEL) / 2, (1 + LEVEL) / 2))
     return Interval(float(sample.mean()), float(low), float(high), len(sample))
+
+
+def share(values: ArrayLike) -> Interval:
+    """The mean of (n,) values that are 0 or 1, one a query, n at least 1, with Wilson's interval, which holds near 0 and 1, too.
+
+    Values between, where a query was tried with several seeds and succeeded with some, count as so much of a success; n stays
+    the number of queries, so the interval is no narrower for it.
+    """
+    sample = np.asarray(values, dtype=np.float64)
+    mean, count = float(sample.mean()), len(sample)
+    z = float(norm.ppf((1 + LEVEL) / 2))
+    centre = (mean + z**2 / (2 * count)) / (1 + z**2 / count)
+    reach = z / (1 + z**2 / count) * math.sqrt(mean * (1 - mean) / count + z**2 / (4 * count**2))
+    return Interval(mean, max(0.0, centre - reach), min(1.0, centre + reach), count)
 
 
 def rank_correlation(one: Sequence[float], other: Sequence[float]) -> float:
