@@ -28,12 +28,17 @@ def describe(plugins: Iterable[object]) -> dict[str, Any]:
         "version": version(DISTRIBUTION),
         "source": source_digest(plugins),
         "python": platform.python_version(),
-        **{library: version(library) for library in LIBRARIES},
+        **libraries(),
         "machine": f"{platform.system()} {platform.machine()}",
         "device": device.type,
         "dtype": str(pick_dtype(device)).removeprefix("torch."),
         "threads": torch.get_num_threads(),
     }
+
+
+def libraries() -> dict[str, str]:
+    """The versions of those libraries that results depend on."""
+    return {library: version(library) for library in LIBRARIES}
 
 
 def source_digest(plugins: Iterable[object]) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, final
 
 import numpy as np
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
     from bench.datasets.scene import Scene
     from bench.public import Public
+    from bench.units import Collection, Images, Unit
 
 
 class Asset(str):
@@ -271,12 +272,20 @@ class Extractor(Plugin, ABC):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Shot:
+    """One image of a unit: what only its owner has, and what was released of it."""
+
+    pixels: Callable[[], Bytes]  # (H, W, 3); read when it is asked for
+    secret: Features
+    release: Release
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Trial:
     """One unit of one cell of the experiment: the truth, what was released of it, and who attacks."""
 
-    pixels: Bytes  # (H, W, 3) the photograph
-    secret: Features
-    release: Release
+    unit: Unit
+    shots: tuple[Shot, ...]  # one for each image of the unit
     defense: Defense
     attack: Attack | None  # None where the task judges the release itself
     extractor: Extractor
@@ -284,7 +293,25 @@ class Trial:
     metrics: tuple[Metric, ...]
     rng: np.random.Generator
     others: Callable[[int], Iterator[Release]]  # the first so many releases of other photographs
-    repeats: tuple[Release, ...]  # further releases of the same features
+    repeats: tuple[Release, ...]  # further releases of the first image's features
+
+    @property
+    def secret(self) -> Features:
+        """Of the unit's first image, for most the only one."""
+        return self.shots[0].secret
+
+    @property
+    def release(self) -> Release:
+        """Of the unit's first image, for most the only one."""
+        return self.shots[0].release
+
+    def pixels(self) -> Bytes:
+        """(H, W, 3) of the unit's first image, for most the only one."""
+        return self.shots[0].pixels()
+
+    def released(self, release: Release) -> Trial:
+        """The same trial, had that been released of the unit's first image."""
+        return replace(self, shots=(replace(self.shots[0], release=release), *self.shots[1:]))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -300,6 +327,17 @@ class Task(Plugin, ABC):
     """What a release is judged by. The runner plans, resumes and records; a task does one trial at a time."""
 
     attacked: ClassVar[bool]  # whether it judges what an attack makes of the release, and not the release itself
+    places: ClassVar[bool] = False  # whether it is about a place, even if none is named
+
+    @abstractmethod
+    def collection(self, images: Images, dataset: Dataset | None) -> Collection:
+        """What there is to judge, given photographs or a place; the built-in ones where neither is given.
+
+        Raises
+        ------
+        UserError
+            if they are missing or damaged, or are not what this task judges.
+        """
 
     @abstractmethod
     def inapplicable(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> str | None:

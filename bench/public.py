@@ -6,16 +6,21 @@ import hashlib
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from bench.errors import UserError
 from bench.features import dictionary
 from bench.features.dictionary import Dictionary
 from bench.types import Bytes, Features, Floats, Indices
 
+if TYPE_CHECKING:
+    from bench.place import Place
+
 ASSETS = Path(__file__).parent / "assets"
 
 # What an asset's name stands for in this distribution. The attacker's database is made from other photographs.
 SHIPPED = {"shipped": "dictionary.safetensors", "shipped-public": "public-database.safetensors"}
+REFERENCES = "references"
 
 Quantiser = Callable[[Dictionary, Bytes | Floats], Indices]
 
@@ -28,6 +33,7 @@ class Public:
     quantiser : finds the nearest words of (N, D) rows in a dictionary
     remembered : number of photographs whose quantisation is kept
     known : dictionaries by name that are in no file
+    place : what is served, where it is a place: the dictionary called `references` is made from its reference images
     """
 
     def __init__(
@@ -35,7 +41,9 @@ class Public:
         quantiser: Quantiser = lambda known, rows: known.index.nearest(rows),
         remembered: int = 64,
         known: Mapping[str, Dictionary] | None = None,
+        place: Place | None = None,
     ) -> None:
+        self.place = place
         self._quantiser = quantiser
         self._dictionaries = {(name, 0): dictionary for name, dictionary in (known or {}).items()}
         self._quantised: OrderedDict[str, Indices] = OrderedDict()
@@ -44,15 +52,35 @@ class Public:
     def dictionary(self, asset: str, words: int = 0) -> Dictionary:
         """The first `words` words, all if 0, of the dictionary called `shipped` or `shipped-public`, or of that of a file.
 
+        Of `references`: as many words, clustered from the reference images of the place.
+
         Raises
         ------
         UserError
             if it is missing or damaged.
         """
         if (asset, words) not in self._dictionaries:
-            known = self.dictionary(asset).first(words) if words else dictionary.load(dictionary_path(asset))
+            if asset == REFERENCES:  # clustered into so many words: the first of more words would serve worse
+                known = self._served().dictionary(words)
+            else:
+                known = self.dictionary(asset).first(words) if words else dictionary.load(dictionary_path(asset))
             self._dictionaries[asset, words] = known
         return self._dictionaries[asset, words]
+
+    def digest(self, asset: str) -> str:
+        """What records know a dictionary by.
+
+        Raises
+        ------
+        UserError
+            if it is missing or damaged.
+        """
+        return self._served().digest if asset == REFERENCES else self.dictionary(asset).digest
+
+    def _served(self) -> Place:
+        if self.place is None:
+            raise UserError(f"dictionary={REFERENCES} is made from a place's reference images, and this task is about no place")
+        return self.place
 
     def nearest_words(self, asset: str, features: Features, words: int = 0) -> Indices:
         """For each descriptor the word of greatest cosine among the first `words`, ties to the lowest. -> (N,) int64, a copy

@@ -37,8 +37,8 @@ def short_hash(value: Any) -> str:
 
 
 def cell_id(task: Any, defense: Any, attack: Any, dataset: dict[str, Any], seed: int, metric_settings: Any) -> str:
-    """Hash of the configuration and the inputs. A dataset's name is neither."""
-    content = {key: value for key, value in dataset.items() if key != "name"}
+    """Hash of the configuration and the inputs. How a dataset is called is neither."""
+    content = {key: value for key, value in dataset.items() if key not in ("name", "spec")}
     return short_hash([SCHEMA, task, defense, attack, content, seed, metric_settings])
 
 

@@ -13,7 +13,7 @@ import itertools
 import logging
 import time
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,20 +21,21 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from bench import composition, environment, records, registry, spec
-from bench.datasets import photographs
-from bench.datasets.photographs import Photograph, Source
+from bench import composition, environment, pool, records, registry, spec, units
+from bench.datasets.photographs import Source
 from bench.errors import PluginError, UnitError, UserError, blamed
+from bench.features import kept
 from bench.features.sift import Sift
-from bench.plugin import Attack, Defense, Extractor, Metric, Outcome, Privacy, Task, Trial
+from bench.place import Place
+from bench.plugin import Attack, Dataset, Defense, Extractor, Metric, Outcome, Privacy, Shot, Task, Trial
 from bench.population import Population
 from bench.public import Public
 from bench.records import EVERY_UNIT, Record
 from bench.tasks.reconstruction import Reconstruction
-from bench.types import Features, Floats, Release
+from bench.types import Bytes, Features, Floats, Release
+from bench.units import Images, ImageSource, Unit
 
 ERRORS = "errors.log"
-Images = Path | str | Sequence[Path | str | Source] | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,14 +50,27 @@ class Cell:
     reason: str | None  # why it does not apply, if it does not
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Asked:
+    """What a plan is made from. Can be pickled, so that other processes make the same plan."""
+
+    pairs: tuple[tuple[Defense, Attack | None], ...]
+    images: Images
+    task: Task
+    extractor: Extractor
+    dataset: Dataset | None
+    seed: int
+
+
 @dataclass(frozen=True, eq=False)
 class Plan:
     """Everything that a run will do, checked as far as it can be without doing it."""
 
+    asked: Asked
     task: Task
     cells: tuple[Cell, ...]
-    sources: tuple[Source, ...]
-    hashes: dict[str, str]  # photograph's name -> its content's hash
+    units: tuple[Unit, ...]
+    hashes: Mapping[str, str]  # unit's name -> its content's hash
     extractor: Extractor
     metrics: tuple[Metric, ...]
     public: Public
@@ -69,7 +83,7 @@ class Plan:
 
     def __len__(self) -> int:
         """The number of its records."""
-        return sum(1 if cell.reason else len(self.sources) for cell in self.cells)
+        return sum(1 if cell.reason else len(self.units) for cell in self.cells)
 
 
 def run(
@@ -79,10 +93,11 @@ def run(
     *,
     extractor: Extractor | None = None,
     task: Task | None = None,
+    dataset: Dataset | None = None,
     seed: int = 0,
     out: Path | str | None = None,
 ) -> list[Record]:
-    """Run every defense against every attack, and return one record for each photograph of each pair.
+    """Run every defense against every attack, and return one record for each unit, such as a photograph, of each pair.
 
     Parameters
     ----------
@@ -90,6 +105,7 @@ def run(
     images : a folder, files or sources, or None for the built-in photographs
     extractor : `Sift()` if None
     task : `Reconstruction()` if None
+    dataset : the place that it is about, for a task that is about one
     seed : of everything random. A release whose seed is known is for measuring and protects nobody.
     out : a folder to keep records and reconstructions in; what it holds already is not done again
 
@@ -98,7 +114,7 @@ def run(
     UserError
         if something is wrong with what was asked; nothing has been written then.
     """
-    plan = prepare(defenses, attacks, images, extractor=extractor, task=task, seed=seed)
+    plan = prepare(defenses, attacks, images, extractor=extractor, task=task, dataset=dataset, seed=seed)
     return list(execute(plan, None if out is None else Path(out)))
 
 
@@ -109,6 +125,7 @@ def prepare(
     *,
     extractor: Extractor | None = None,
     task: Task | None = None,
+    dataset: Dataset | None = None,
     seed: int = 0,
 ) -> Plan:
     """Check what was asked, and lay out what is to be done. Parameters as those of `run`.
@@ -127,7 +144,7 @@ def prepare(
         raise UserError(f"{task.name()} judges the release itself and takes no attack")
     tried: Sequence[Attack | None] = attacks or [None]
     pairs = [(defense, attack) for defense in defenses for attack in tried]
-    return prepare_pairs(pairs, images, extractor=extractor, task=task, seed=seed)
+    return prepare_pairs(pairs, images, extractor=extractor, task=task, dataset=dataset, seed=seed)
 
 
 def prepare_pairs(
@@ -136,6 +153,7 @@ def prepare_pairs(
     *,
     task: Task,
     extractor: Extractor | None = None,
+    dataset: Dataset | None = None,
     seed: int = 0,
 ) -> Plan:
     """As `prepare`, for these pairs of a defense and an attack instead of all; None where the task judges the release itself.
@@ -145,25 +163,41 @@ def prepare_pairs(
     UserError
         as `prepare`.
     """
-    extractor = extractor or Sift()
-    name, sources = _dataset(images)
-    hashes = {source.name: _content_hash(source) for source in sources}
-    public = Public()
-    dataset = {
-        "name": name,
-        "hash": "sha256:" + hashlib.sha256(records.canonical(hashes).encode()).hexdigest(),
+    asked = Asked(pairs=tuple(pairs), images=images, task=task, extractor=extractor or Sift(), dataset=dataset, seed=seed)
+    plan = planned(asked)
+    _rehearse(plan)
+    return plan
+
+
+def planned(asked: Asked) -> Plan:
+    """The plan, before anything was tried.
+
+    Raises
+    ------
+    UserError
+        if something is wrong with what was asked, or no pair of it applies.
+    """
+    task, extractor, dataset, seed = asked.task, asked.extractor, asked.dataset, asked.seed
+    collection = task.collection(asked.images, dataset)
+    hashes = {unit.name: unit.content_hash() for unit in collection.units}
+    public = Public(place=None if collection.scene is None else Place(collection.scene, extractor))
+    judged = {
+        "name": collection.name,
+        "spec": None if dataset is None else spec.written(dataset),
+        "hash": units.digest(hashes | dict(collection.beside)),
         "extractor": spec.configuration(extractor, public),
     }
-    metrics = tuple(metric() for metric in registry.everything(registry.METRIC))
+    metrics = tuple(metric() for metric in registry.everything(registry.METRIC)) if task.attacked else ()
     settings = {metric.name(): _settings(metric) for metric in metrics}
-    taking_part = [plugin for pair in pairs for plugin in pair if plugin is not None]
+    taking_part = [plugin for pair in asked.pairs for plugin in pair if plugin is not None]
     ran = environment.describe([task, extractor, *taking_part, *metrics])
+    sources = [image for unit in collection.units for image in unit.images if isinstance(image, Source)]
     populations: dict[Defense, Population] = {}
     cells = []
-    for defense, attack in pairs:
+    for defense, attack in asked.pairs:
         protected = spec.configuration(defense, public)
         if defense not in populations:
-            drawn = functools.partial(randomness, "population", seed, protected, dataset["extractor"])
+            drawn = functools.partial(randomness, "population", seed, protected, judged["extractor"])
             populations[defense] = Population(sources, extractor, defense, public, drawn)
         reason = task.inapplicable(defense, attack, extractor, public)
         head = {
@@ -171,23 +205,25 @@ def prepare_pairs(
             "task": task.name(),
             "defense": protected,
             "attack": _attack_configuration(task, defense, attack, extractor, public, reason),
-            "dataset": dataset,
+            "dataset": judged,
             "metric_settings": settings,
             "seed": seed,
         }
-        cell_id = records.cell_id(spec.written(task), head["defense"], head["attack"], dataset, seed, settings)
+        cell_id = records.cell_id(spec.written(task), head["defense"], head["attack"], judged, seed, settings)
         head |= {"cell_id": cell_id, "run_hash": records.run_hash(cell_id, ran), "environment": ran}
         cells.append(Cell(defense, attack, defense.privacy(public), populations[defense], head, reason))
     if all(cell.reason for cell in cells):
         raise UserError("nothing to run: " + "; ".join(sorted({str(cell.reason) for cell in cells})))
     unique = {cell.head["cell_id"]: cell for cell in cells}  # one that was asked for twice is done once
-    plan = Plan(task, tuple(unique.values()), tuple(sources), hashes, extractor, metrics, public, seed)
-    _rehearse(plan)
-    return plan
+    return Plan(asked, task, tuple(unique.values()), collection.units, hashes, extractor, metrics, public, seed)
 
 
-def execute(plan: Plan, out: Path | None = None) -> Iterator[Record]:
-    """Do what was planned and yield its records, those that `out` holds already included.
+def execute(plan: Plan, out: Path | None = None, workers: int = 1) -> Iterator[Record]:
+    """Do what was planned and yield its records, those that `out` holds already included, always in the same order.
+
+    Parameters
+    ----------
+    workers : processes that do it; of more than one each does whole units
 
     Raises
     ------
@@ -196,8 +232,9 @@ def execute(plan: Plan, out: Path | None = None) -> Iterator[Record]:
     OSError
         if the disk is full; every record yielded so far is kept.
     """
+    maker = _alone if workers <= 1 else functools.partial(pool.units, workers=workers)
     if out is None:
-        yield from (record for record, _ in _executed(plan, {}, None))
+        yield from (record for record, _ in _executed(plan, {}, functools.partial(maker, plan, None)))
         return
     file = out / records.FILE
     before = records.read(file) if file.is_file() else records.Contents([], 0)
@@ -205,7 +242,7 @@ def execute(plan: Plan, out: Path | None = None) -> Iterator[Record]:
         logging.getLogger(__name__).warning(before.notice)
     done = {(record["run_hash"], record["unit"]): record for record in before.records if record["status"] != "failed"}
     with records.Log(file) as log:
-        for record, fresh in _executed(plan, done, out):
+        for record, fresh in _executed(plan, done, functools.partial(maker, plan, out)):
             if fresh:
                 log.append(record)
             yield record
@@ -219,26 +256,6 @@ def picture(out: Path, record: Record) -> Path:
 def randomness(*parts: Any) -> np.random.Generator:
     """A generator that is a function of `parts` alone, which are JSON."""
     return np.random.default_rng(int(hashlib.sha256(records.canonical(parts).encode()).hexdigest(), 16))
-
-
-def _dataset(images: Images) -> tuple[str, list[Source]]:
-    if images is None:
-        return "builtin", photographs.builtin()
-    if isinstance(images, (str, Path)):
-        return Path(images).resolve().name, photographs.folder(Path(images))
-    sources = [image if isinstance(image, Source) else Source(Path(image).name, Path(image)) for image in images]
-    if len({source.name for source in sources}) < len(sources):
-        raise UserError("two of the photographs have the same file name")
-    if not sources:
-        raise UserError("no photograph was given")
-    return "files", sources
-
-
-def _content_hash(source: Source) -> str:
-    try:
-        return source.content_hash()
-    except OSError as error:
-        return f"unreadable: {error.strerror}"  # its record will be `failed`
 
 
 def _settings(metric: Metric) -> dict[str, Any]:
@@ -258,10 +275,10 @@ def _attack_configuration(
 
 
 def _rehearse(plan: Plan) -> None:
-    """Protect one keypoint of the first good photograph, so that a user's mistake shows before anything is written."""
-    for source in plan.sources:
+    """Protect one keypoint of the first good image, so that a user's mistake shows before anything is written."""
+    for unit in plan.units:
         try:
-            features = _observe(plan, source)[1]
+            features = _observed(plan, unit.images[0]).features
         except UnitError:
             continue
         one = features.take(np.arange(1))
@@ -271,53 +288,86 @@ def _rehearse(plan: Plan) -> None:
         return
 
 
-def _executed(plan: Plan, done: Mapping[tuple[str, str], Record], out: Path | None) -> Iterator[tuple[Record, bool]]:
+Work = tuple[Unit, Sequence[Cell]]
+
+
+def _executed(
+    plan: Plan, done: Mapping[tuple[str, str], Record], make: Callable[[Sequence[Work]], Iterator[Iterable[Record]]]
+) -> Iterator[tuple[Record, bool]]:
     """All records in order, and whether each was made just now. What holds for every unit comes with the first."""
-    cells = plan.cells
-    for source in plan.sources:
-        units = [source.name if cell.reason is None else EVERY_UNIT for cell in cells]
-        known = [done.get((cell.head["run_hash"], unit)) for cell, unit in zip(cells, units, strict=True)]
-        left = [cell for cell, earlier in zip(cells, known, strict=True) if earlier is None and cell.reason is None]
-        fresh = _unit(plan, source, left, out)
-        for cell, earlier in zip(cells, known, strict=True):
-            if earlier is not None:
+    applicable = [cell for cell in plan.cells if cell.reason is None]
+    left = [(unit, [cell for cell in applicable if (cell.head["run_hash"], unit.name) not in done]) for unit in plan.units]
+    for place, ((unit, _), made) in enumerate(zip(left, make(left), strict=True)):
+        fresh = iter(made)
+        for cell in applicable if place else plan.cells:
+            name = unit.name if cell.reason is None else EVERY_UNIT
+            if (earlier := done.get((cell.head["run_hash"], name))) is not None:
                 yield earlier, False
             elif cell.reason is not None:
-                yield _record(cell, EVERY_UNIT, status="n/a", reason=cell.reason), True
+                yield _record(cell, None, status="n/a", reason=cell.reason), True
             else:
                 yield next(fresh), True
-        cells = tuple(cell for cell in cells if cell.reason is None)
 
 
-def _unit(plan: Plan, source: Source, cells: Sequence[Cell], out: Path | None) -> Iterator[Record]:
-    """Read and extract one photograph, protect it once by each defense, and let every attack at it."""
+def _alone(plan: Plan, out: Path | None, work: Sequence[Work]) -> Iterator[Iterable[Record]]:
+    """Do it here, each record when it is asked for."""
+    return (unit_records(plan, unit, cells, out) for unit, cells in work)
+
+
+@dataclass(frozen=True, eq=False)
+class _Observed:
+    """What the owner of an image has."""
+
+    image: ImageSource
+    features: Features
+    pixels: Callable[[], Bytes]
+    notes: tuple[str, ...]
+
+
+def unit_records(plan: Plan, unit: Unit, cells: Sequence[Cell], out: Path | None) -> Iterator[Record]:
+    """Read and extract one unit, protect it once by each defense, and let every attack at it."""
+    if not cells:
+        return
     try:
-        photograph, features = _observe(plan, source)
+        observed = [_observed(plan, image) for image in unit.images]
     except (UnitError, UserError) as error:
-        yield from _failed(cells, source, error, out)
+        yield from _failed(cells, unit, error, out)
         return
     for _, group in itertools.groupby(cells, key=lambda cell: cell.head["defense"]):
         members = list(group)
         try:
-            release = _protect(plan, members[0], features, plan.hashes[source.name])
+            shots = tuple(_shot(plan, members[0], unit, number, seen) for number, seen in enumerate(observed))
         except (UnitError, UserError) as error:
-            yield from _failed(members, source, error, out)
+            yield from _failed(members, unit, error, out)
             continue
         for cell in members:
             try:
-                yield _judged(plan, cell, source, photograph, features, release, out)
+                yield _judged(plan, cell, unit, shots, [note for seen in observed for note in seen.notes], out)
             except (UnitError, UserError) as error:
-                yield from _failed([cell], source, error, out)
+                yield from _failed([cell], unit, error, out)
 
 
-def _observe(plan: Plan, source: Source) -> tuple[Photograph, Features]:
-    with blamed("the reader of photographs"):
-        photograph = photographs.read(source.path)
-    with blamed(f"plugin {plan.extractor.name()}"):
-        features = plan.extractor.extract(photograph.pixels, source.path)
+def _observed(plan: Plan, image: ImageSource) -> _Observed:
+    if isinstance(image, Source):
+        with blamed("the reader of photographs"):
+            pixels, notes = units.read(image)
+        with blamed(f"plugin {plan.extractor.name()}"):
+            features = plan.extractor.extract(pixels, image.path)
+        seen = _Observed(image, features, lambda: pixels, notes)
+    else:
+        with blamed(f"plugin {plan.extractor.name()}"):
+            features = kept.features(plan.extractor, image)
+        seen = _Observed(image, features, image.read, ())
     if len(features) == 0:
-        raise UnitError(f"{source.name}: no keypoint was found")
-    return photograph, features
+        raise UnitError("no keypoint was found")
+    return seen
+
+
+def _shot(plan: Plan, cell: Cell, unit: Unit, number: int, seen: _Observed) -> Shot:
+    """The release of one image of a unit: that of the first is a function of its content alone."""
+    content = plan.hashes[unit.name] if len(unit.images) == 1 else seen.image.content_hash()
+    release = _protect(plan, cell, seen.features, content)
+    return Shot(pixels=seen.pixels, secret=seen.features, release=release)
 
 
 def _protect(plan: Plan, cell: Cell, features: Features, content: str, *repetition: int) -> Release:
@@ -333,28 +383,27 @@ def _protect(plan: Plan, cell: Cell, features: Features, content: str, *repetiti
     return release
 
 
-def _judged(
-    plan: Plan, cell: Cell, source: Source, photograph: Photograph, features: Features, release: Release, out: Path | None
-) -> Record:
+def _judged(plan: Plan, cell: Cell, unit: Unit, shots: tuple[Shot, ...], notes: Sequence[str], out: Path | None) -> Record:
     head = cell.head
-    content = plan.hashes[source.name]
+    content = plan.hashes[unit.name]
+    first = shots[0].secret
     trial = Trial(
-        pixels=photograph.pixels,
-        secret=features,
-        release=release,
+        unit=unit,
+        shots=shots,
         defense=cell.defense,
         attack=cell.attack,
         extractor=plan.extractor,
         public=plan.public,
         metrics=plan.metrics,
         rng=randomness("attack", plan.seed, content, head["defense"], head["dataset"]["extractor"], head["attack"]),
-        others=cell.population.without(source.name),
-        repeats=tuple(_protect(plan, cell, features, content, number) for number in _repetitions(cell.attack)),
+        others=cell.population.without(unit.name),
+        repeats=tuple(_protect(plan, cell, first, content, number) for number in _repetitions(cell.attack)),
     )
     started = time.perf_counter()
     with blamed(f"task {plan.task.name()}"):
         outcome = plan.task.judge(trial)
-    record = _record(cell, source.name, status="ok", outcome=outcome, keypoints=len(features), notes=photograph.notes)
+    keypoints = max(len(shot.secret) for shot in shots)
+    record = _record(cell, unit, status="ok", outcome=outcome, keypoints=keypoints, notes=notes)
     record["seconds"] = time.perf_counter() - started
     if out is not None and outcome.image is not None:
         _save_picture(picture(out, record), outcome.image)
@@ -366,17 +415,17 @@ def _repetitions(attack: Attack | None) -> range:
     return range(1, 1 + (0 if attack is None else attack.repeats()))
 
 
-def _failed(cells: Sequence[Cell], source: Source, error: Exception, out: Path | None) -> Iterator[Record]:
+def _failed(cells: Sequence[Cell], unit: Unit, error: Exception, out: Path | None) -> Iterator[Record]:
     if isinstance(error, PluginError) and out is not None:
         with (out / ERRORS).open("a", encoding="utf-8") as log:
-            log.write(f"{source.name}\n{''.join(traceback.format_exception(error))}\n")
+            log.write(f"{unit.name}\n{''.join(traceback.format_exception(error))}\n")
     for cell in cells:
-        yield _record(cell, source.name, status="failed", reason=str(error))
+        yield _record(cell, unit, status="failed", reason=str(error))
 
 
 def _record(
     cell: Cell,
-    unit: str,
+    unit: Unit | None,
     *,
     status: str,
     reason: str | None = None,
@@ -384,8 +433,10 @@ def _record(
     keypoints: int | None = None,
     notes: Sequence[str] = (),
 ) -> Record:
+    """The record of a unit, or of all of them for None. `keypoints` are those of its image that has most."""
     return cell.head | {
-        "unit": unit,
+        "unit": EVERY_UNIT if unit is None else unit.name,
+        "condition": None if unit is None else unit.condition,
         "status": status,
         "reason": reason,
         "metrics": {} if outcome is None else {**outcome.metrics, "keypoints": keypoints},
@@ -396,7 +447,7 @@ def _record(
 
 
 def _privacy(cell: Cell, keypoints: int | None) -> dict[str, Any]:
-    """What the defense promises of what the attacker sees of one photograph, and what nothing covers."""
+    """What the defense promises of what is released of one image, and what nothing covers."""
     epsilon, remembers = cell.privacy.epsilon, cell.defense.remembers()
     # A device that remembers answers once, however often it is asked.
     releases = 1 if remembers or cell.attack is None else 1 + cell.attack.repeats()

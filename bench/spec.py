@@ -76,7 +76,7 @@ def configuration(plugin: Plugin, public: Public, resolved: Mapping[str, Any] | 
         if a dictionary is missing or damaged.
     """
     known = dict(resolved or {})
-    digests = {name: public.dictionary(asset).digest for name, asset in fields.asset_fields(plugin).items() if name not in known}
+    digests = {name: public.digest(asset) for name, asset in fields.asset_fields(plugin).items() if name not in known}
     return written(plugin) | digests | known
 
 

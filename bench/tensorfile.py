@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,7 @@ def save(path: Path, kind: str, arrays: Arrays, meta: dict[str, Any]) -> str:
 
     digest = content_digest(kind, arrays, meta)
     path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(path.name + ".unfinished")
+    unfinished = path.with_name(f"{path.name}.{os.getpid()}.unfinished")  # others may be writing the same
     header = {"kind": kind, "digest": digest, "meta": json.dumps(meta, sort_keys=True, allow_nan=False)}
     save_file({name: np.ascontiguousarray(array) for name, array in arrays.items()}, unfinished, header)
     unfinished.replace(path)

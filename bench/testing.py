@@ -19,12 +19,16 @@ import numpy as np
 from bench.datasets.photographs import SIDE
 from bench.features import dictionary
 from bench.kernels.search import unit_rows
-from bench.plugin import Asset, Attack, Defense, DescriptorAttack, Extractor, ImageAttack, Metric, Trial
+from bench.plugin import Asset, Attack, Defense, DescriptorAttack, Extractor, ImageAttack, Metric, Shot, Trial
 from bench.public import Public
 from bench.tasks.reconstruction import Reconstruction, view
 from bench.types import Descriptors, Features, Floats, Indices, Release, Subspaces, WordSets
+from bench.units import Unit
 
 TOLERANCE = 1e-5  # of norms and angles in float32
+
+
+NO_UNIT = Unit(name="made up", images=())
 
 
 def example_features(count: int = 50, seed: int = 0, length: int = 128) -> Features:
@@ -34,6 +38,11 @@ def example_features(count: int = 50, seed: int = 0, length: int = 128) -> Featu
     codes[:, 0] |= 1  # no row is zero
     keypoints = rng.uniform(0, SIDE, (count, 2)).astype(np.float32)
     return Features(keypoints=keypoints, descriptors=unit_rows(codes), codes=codes, size=(SIDE, SIDE))
+
+
+def shot(secret: Features, release: Release) -> Shot:
+    """Features and their release, of a black photograph."""
+    return Shot(pixels=lambda: np.zeros((*secret.size[::-1], 3), np.uint8), secret=secret, release=release)
 
 
 def small_dictionary(folder: Path, words: int = 512, seed: int = 1) -> Asset:
@@ -92,9 +101,8 @@ def check_attack(attack: Attack, defense: Defense, extractor: Extractor, secret:
         return (defense.protect(features, Public(), np.random.default_rng(4)) for features in strangers[:count])
 
     trial = Trial(
-        pixels=np.zeros((*secret.size[::-1], 3), np.uint8),
-        secret=mine,
-        release=defense.protect(mine, public, np.random.default_rng(1)),
+        unit=NO_UNIT,
+        shots=(shot(mine, defense.protect(mine, public, np.random.default_rng(1))),),
         defense=defense,
         attack=attack,
         extractor=extractor,

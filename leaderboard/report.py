@@ -1,4 +1,4 @@
-"""Writes what people read of a run: report.md, report.csv, and a figure for each photograph."""
+"""Writes what people read of a run: report.md, report.csv, and a figure for each unit of which an image was made."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from pathlib import Path
 
 from PIL import Image
 
-from bench.datasets import photographs
-from bench.datasets.photographs import Source
+from bench import units
 from bench.errors import UnitError
 from bench.records import Record
 from bench.runner import picture
+from bench.units import Unit
 from leaderboard import figures, tables
 
 
-def write(records: Sequence[Record], sources: Sequence[Source], out: Path) -> None:
+def write(records: Sequence[Record], judged: Sequence[Unit], out: Path) -> None:
     """Write the report of `records` into the folder `out`, which keeps their reconstructions and then the photographs, too.
 
     Raises
@@ -26,10 +26,10 @@ def write(records: Sequence[Record], sources: Sequence[Source], out: Path) -> No
     found = tables.tables(records)
     (out / "report.md").write_text("\n".join(map(tables.to_markdown, found)), encoding="utf-8", errors="replace")
     (out / "report.csv").write_text(tables.to_csv(found), encoding="utf-8", errors="replace")
-    for source in sources:
-        of_it = [record for record in records if record["unit"] == source.name]
+    for unit in judged:
+        of_it = [record for record in records if record["unit"] == unit.name]
         if any(picture(out, record).is_file() for record in of_it):
-            _figure(source, of_it, out)
+            _figure(unit, of_it, out)
 
 
 def photograph(out: Path, record: Record) -> Path:
@@ -38,15 +38,15 @@ def photograph(out: Path, record: Record) -> Path:
     return out / "photographs" / content / f"{record['unit']}.png"
 
 
-def _figure(source: Source, records: Sequence[Record], out: Path) -> None:
+def _figure(unit: Unit, records: Sequence[Record], out: Path) -> None:
     try:
-        original = photographs.read(source.path).pixels
+        original = units.read(unit.images[0])[0]
     except UnitError:
         return  # it has gone since
-    kept, path = photograph(out, records[0]), out / "figures" / f"{source.name}.png"
+    kept, path = photograph(out, records[0]), out / "figures" / f"{unit.name}.png"
     for folder in (kept.parent, path.parent):
         folder.mkdir(parents=True, exist_ok=True)
     Image.fromarray(original).save(kept)
     shown = figures.panels(original, records, [picture(out, record) for record in records])
     # Without the software's version, the same run gives the same file.
-    figures.draw(shown, f"{source.name}. {tables.SEEDED}").savefig(path, metadata={"Software": None})
+    figures.draw(shown, f"{unit.name}. {tables.SEEDED}").savefig(path, metadata={"Software": None})

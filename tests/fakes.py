@@ -13,6 +13,7 @@ from bench.datasets.scene import File, Reference, Scene, SceneImage
 from bench.features.sift import Sift
 from bench.plugin import Defense, Trial
 from bench.public import Public
+from bench.testing import NO_UNIT, shot
 from bench.types import Features, Release
 
 FAKES = {
@@ -72,9 +73,8 @@ def trial(defense: Defense, secret: Features, *, rng: np.random.Generator | None
     """A trial of a task that judges the release itself, of features without a photograph."""
     public = Public()
     return Trial(
-        pixels=np.zeros((*secret.size[::-1], 3), dtype=np.uint8),
-        secret=secret,
-        release=defense.protect(secret, public, np.random.default_rng(1)),
+        unit=NO_UNIT,
+        shots=(shot(secret, defense.protect(secret, public, np.random.default_rng(1))),),
         defense=defense,
         attack=None,
         extractor=Sift(),

@@ -46,7 +46,7 @@ def found(
     """Whether each estimate is near its descriptor."""
     defense = Affine(dim=4, sub_databases=1, database=database)
     release = defense.protect(secret, Public(), np.random.default_rng(seed))
-    seen = view(dataclasses.replace(trial(defense, secret, others=others), attack=attack, release=release))
+    seen = view(dataclasses.replace(trial(defense, secret, others=others).released(release), attack=attack))
     estimates = attack.recover(seen, np.random.default_rng(0))
     return (estimates * secret.descriptors).sum(axis=1) > np.cos(np.radians(NEAR))
 

@@ -15,6 +15,7 @@ from bench.population import Population
 from bench.public import Public
 from bench.runner import randomness
 from bench.tasks.reconstruction import RELEASES, Reconstruction, view
+from bench.testing import NO_UNIT, shot
 from bench.types import Features, Floats, Knowledge, Release, Subspaces
 from defenses.affine import Affine
 from defenses.ldp import LDP
@@ -50,9 +51,8 @@ def trial(attack: Attack, defense: Affine | LDP, secret: Features, others: int |
         return population.without("astronaut")(count if others is None else min(count, others))
 
     return Trial(
-        pixels=np.zeros((256, 256, 3), np.uint8),
-        secret=secret,
-        release=defense.protect(secret, public, np.random.default_rng(1)),
+        unit=NO_UNIT,
+        shots=(shot(secret, defense.protect(secret, public, np.random.default_rng(1))),),
         defense=defense,
         attack=attack,
         extractor=Sift(),
@@ -98,14 +98,13 @@ def test_the_basis_that_was_drawn_says_nothing(plugin, database, secret):
     assert Reconstruction().inapplicable(defense, attack, Sift(), Public()) is None
     first = trial(attack, defense, secret)
     rng = np.random.default_rng(5)
-    second = dataclasses.replace(
-        first, release=rewritten(first.release, rng), repeats=tuple(rewritten(release, rng) for release in first.repeats)
-    )
+    repeats = tuple(rewritten(release, rng) for release in first.repeats)
+    second = dataclasses.replace(first.released(rewritten(first.release, rng)), repeats=repeats)
     apart = angles(estimate(first), estimate(second))
     assert np.mean(apart < 0.1) > 0.95  # degrees; float32 turns a few close decisions over
     if not attack.needs & {Knowledge.REPEATED_RELEASES}:
         turned = secret.take(np.roll(np.arange(len(secret)), 1))
-        elsewhere = dataclasses.replace(first, release=defense.protect(turned, Public(), np.random.default_rng(6)))
+        elsewhere = first.released(defense.protect(turned, Public(), np.random.default_rng(6)))
         assert np.median(angles(estimate(first), estimate(elsewhere))) > 5  # negative control: other subspaces
 
 

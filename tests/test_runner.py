@@ -356,3 +356,17 @@ def test_a_device_that_remembers_gives_one_answer_in_all_photographs(images: Pat
     seen.clear()
     run([Watching(dictionary=small)], [Painter()], images)
     assert any(len(answers) > 1 for answers in seen.values())  # the control
+
+
+def test_processes_make_the_same_records_in_the_same_order(images: Path, small: Asset, tmp_path: Path) -> None:
+    (images / "bad.jpg").write_bytes(b"no photograph")
+    grid = [LDP(epsilon=8, dictionary=small), Undefended()], [Painter(), Guess()]
+    plan = runner.prepare(*grid, images, task=PAINT)
+    alone = judged(list(runner.execute(plan, tmp_path / "alone")))
+    together: Iterator[Record] = runner.execute(plan, tmp_path / "together", workers=2)
+    next(together)
+    together.close()  # interrupted after a record  # type: ignore[attr-defined]
+    assert judged(list(runner.execute(plan, tmp_path / "together", workers=2))) == alone
+    pictures = {path.relative_to(tmp_path / "alone") for path in (tmp_path / "alone").rglob("*.png")}
+    assert pictures == {path.relative_to(tmp_path / "together") for path in (tmp_path / "together").rglob("*.png")}
+    assert {record["status"] for record in alone} == {"ok", "n/a", "failed"}

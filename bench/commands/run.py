@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bench.errors import UserError
-from bench.terminal import DONE, FAILED, add_extractor, add_seed, print_rich, say
+from bench.terminal import DONE, FAILED, add_extractor, add_seed, print_rich, say, whole
 
 if TYPE_CHECKING:
-    from bench.plugin import Task
+    from bench.plugin import Defense, Task
     from bench.records import Record
     from bench.runner import Plan
 
@@ -35,6 +35,10 @@ def options(parser: argparse.ArgumentParser) -> None:
     )
     add_extractor(parser)
     parser.add_argument("--images", type=Path, metavar="DIR", help="a folder of photographs (default: seven built-in ones)")
+    parser.add_argument(
+        "--dataset", metavar="SPEC", help="the place that a task is about (default: the task's; bench list datasets)"
+    )
+    parser.add_argument("--workers", type=whole, default=1, metavar="N", help="processes (default: %(default)s)")
     add_seed(parser)
     parser.add_argument(
         "--out", type=Path, metavar="DIR", help="folder for the results; resumed if it exists (default: in runs/)"
@@ -43,25 +47,27 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(args: argparse.Namespace) -> int:
-    from bench import registry, runner, spec
+    from bench import pool, registry, runner, spec
     from bench.progress import Progress
     from leaderboard import report
 
+    pool.share(args.workers)
     task = spec.read(args.task, registry.TASK)
     _check_attacks(task, args.attack)
     plan = runner.prepare(
-        [spec.read(text, registry.DEFENSE) for text in args.defense],
+        [_defense(text, task) for text in args.defense],
         [spec.read(text, registry.ATTACK) for text in args.attack or []],
         args.images,
         extractor=spec.read(args.extractor, registry.EXTRACTOR),
         task=task,
+        dataset=None if args.dataset is None else spec.read(args.dataset, registry.DATASET),
         seed=args.seed,
     )
     out = args.out or Path("runs") / _run_name(plan)
     records: list[Record] = []
     noted: set[str] = set()
-    with Progress(f"{len(plan.sources)} photographs, {len(plan.cells)} pairs", len(plan)) as progress:
-        for record in runner.execute(plan, out):
+    with Progress(f"{plan.task.name()}: {len(plan.units)} units, {len(plan.cells)} pairs", len(plan)) as progress:
+        for record in runner.execute(plan, out, args.workers):
             records.append(record)
             progress.advance(note=record["unit"])
             for note in record["notes"]:
@@ -70,10 +76,22 @@ def execute(args: argparse.Namespace) -> int:
             noted.update(record["notes"])
             if record["status"] == "failed":
                 progress.say(f"bench: failed: {record['unit']}, {record['defense']['name']}: {record['reason']}")
-    report.write(records, plan.sources, out)
+    report.write(records, plan.units, out)
     _print_records(records) if args.json else _print_tables(records)
     say(DONE, f"written to {out}")
     return FAILED if any(record["status"] == "failed" for record in records) else DONE
+
+
+def _defense(text: str, task: Task) -> Defense:
+    """A defense as it is written. Its words are those of the place, if there is one and no others are named."""
+    from bench import registry, spec
+    from bench.plugin import Asset
+    from bench.public import REFERENCES
+
+    plugin, given = spec.parse(text, registry.DEFENSE)
+    if task.places and plugin.quantised_by is not None:
+        given.setdefault(plugin.quantised_by, Asset(REFERENCES))
+    return spec.build(plugin, given)
 
 
 def _check_attacks(task: Task, attacks: list[str] | None) -> None:

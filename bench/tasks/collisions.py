@@ -23,9 +23,10 @@ from bench.errors import UnitError, UserError
 from bench.kernels.meetings import MEETS, Doubles
 from bench.kernels.search import unit_rows
 from bench.kernels.sharing import company, nearest_that_meet
-from bench.plugin import Attack, Defense, Extractor, Lifting, Outcome, Task, Trial, leads_through_no_word
+from bench.plugin import Attack, Dataset, Defense, Extractor, Lifting, Outcome, Task, Trial, leads_through_no_word
 from bench.public import Public
 from bench.types import Release, Subspaces
+from bench.units import Collection, Images, photographs_alone
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,6 +46,9 @@ class Collisions(Task):
             raise UserError(f"collisions: others must be at least 0, got {self.others}")
         if not self.tolerance >= 0:
             raise UserError(f"collisions: tolerance must be at least 0, got {self.tolerance}")
+
+    def collection(self, images: Images, dataset: Dataset | None) -> Collection:
+        return photographs_alone(self, images, dataset)
 
     def inapplicable(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> str | None:
         return leads_through_no_word(defense)

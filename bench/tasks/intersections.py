@@ -24,9 +24,10 @@ from bench import fields
 from bench.errors import UnitError, UserError
 from bench.kernels.search import unit_rows
 from bench.kernels.subspaces import nearest_to_subspaces
-from bench.plugin import Attack, Defense, Extractor, Lifting, Outcome, Task, Trial, leads_through_no_word
+from bench.plugin import Attack, Dataset, Defense, Extractor, Lifting, Outcome, Task, Trial, leads_through_no_word
 from bench.public import Public
 from bench.types import Features, Floats
+from bench.units import Collection, Images, photographs_alone
 
 COUNTS = (50, 20, 10, 5)  # N
 BATCH = 64  # subspaces at a time
@@ -49,6 +50,9 @@ class Intersections(Task):
             raise UserError(f"intersections: ratio must be above 0 and at most 1, got {self.ratio}")
         if self.subspaces < 0:
             raise UserError(f"intersections: subspaces must be at least 0, got {self.subspaces}")
+
+    def collection(self, images: Images, dataset: Dataset | None) -> Collection:
+        return photographs_alone(self, images, dataset)
 
     def inapplicable(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> str | None:
         return leads_through_no_word(defense)

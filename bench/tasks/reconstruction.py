@@ -10,11 +10,24 @@ from typing import Any
 
 import numpy as np
 
-from bench import fields, registry, spec
+from bench import fields, registry, spec, units
 from bench.errors import UnitError, UserError, blamed
-from bench.plugin import Attack, Defense, DescriptorAttack, Extractor, ImageAttack, Metric, Outcome, Task, Trial, View
+from bench.plugin import (
+    Attack,
+    Dataset,
+    Defense,
+    DescriptorAttack,
+    Extractor,
+    ImageAttack,
+    Metric,
+    Outcome,
+    Task,
+    Trial,
+    View,
+)
 from bench.public import Public
 from bench.types import Descriptors, Floats, Knowledge
+from bench.units import Collection, Images
 
 RELEASES = {Knowledge.OTHER_RELEASES, Knowledge.REPEATED_RELEASES}  # which every defense can make
 
@@ -29,6 +42,13 @@ class Reconstruction(Task):
     attacked = True
 
     inverter: str = "dia"  # an attack that reconstructs images
+
+    def collection(self, images: Images, dataset: Dataset | None) -> Collection:
+        if dataset is None:
+            return units.of_photographs(images)
+        if images is not None:
+            raise UserError("reconstruction takes photographs or the queries of a dataset, not both")
+        return units.of_queries(dataset)
 
     def inapplicable(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> str | None:
         if attack is None:
@@ -64,7 +84,7 @@ class Reconstruction(Task):
         if reason is not None:
             return compared(trial, found, None, (*told, f"no image: {reason}"))
         release = Descriptors(keypoints=trial.release.keypoints, size=trial.release.size, descriptors=found)
-        seen = view(dataclasses.replace(trial, attack=inverter, defense=undefended, release=release))
+        seen = view(dataclasses.replace(trial.released(release), attack=inverter, defense=undefended))
         return compared(trial, found, reconstructed(inverter, seen, trial.rng), told)
 
     def _inverter(self, extractor: Extractor, public: Public) -> tuple[ImageAttack, Defense, str | None]:
@@ -127,7 +147,7 @@ def recovered(attack: DescriptorAttack, trial: Trial) -> tuple[Floats, tuple[str
 
 def compared(trial: Trial, descriptors: Floats | None, image: Floats | None, notes: tuple[str, ...] = ()) -> Outcome:
     """Every metric of what was recovered; None for a metric of what was not."""
-    truth = (trial.pixels / 255.0).astype(np.float32)
+    truth = (trial.pixels() / 255.0).astype(np.float32)
     values = {metric.name(): _measured(metric, trial.secret.descriptors, truth, descriptors, image) for metric in trial.metrics}
     return Outcome(metrics=values, image=image, notes=notes)
 

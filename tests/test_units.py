@@ -1,0 +1,91 @@
+"""Units and what is kept of them: queries of a place, their features, and the words of its references."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fakes import scene, texture
+
+from bench import cache, units
+from bench.datasets.gallery import Gallery
+from bench.datasets.scene import Pixels, Scene
+from bench.errors import UserError
+from bench.features import kept
+from bench.features.sift import Sift
+from bench.place import Place
+from bench.public import Public
+from bench.tasks.collisions import Collisions
+from bench.testing import same
+
+TINY = Gallery(views=2, queries=3, width=64, height=48, detail=0.1)
+
+
+@pytest.fixture(autouse=True)
+def _cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(cache.VARIABLE, str(tmp_path / "cache"))
+
+
+def test_queries_are_units_with_their_condition_and_the_whole_scene_counts() -> None:
+    collection = units.of_queries(TINY)
+    assert [unit.condition for unit in collection.units] == ["day", "day", "night"]
+    assert len({unit.content_hash() for unit in collection.units}) == 3
+    other = units.of_queries(dataclasses.replace(TINY, views=3))  # another map, and so another dataset
+    assert collection.beside != other.beside
+
+
+def test_a_task_of_photographs_refuses_a_place() -> None:
+    with pytest.raises(UserError, match="takes no dataset"):
+        Collisions().collection(None, TINY)
+
+
+class Counted(Pixels):
+    """A texture that counts how often it is read."""
+
+    def __init__(self, seed: int) -> None:
+        self.seed, self.reads = seed, 0
+
+    def content_hash(self) -> str:
+        return f"texture {self.seed}"
+
+    def read(self) -> np.ndarray:
+        self.reads += 1
+        return np.array(texture(self.seed))
+
+
+def test_features_are_kept_by_content_and_made_again_when_damaged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    image, extractor = Counted(1), Sift()
+    first = kept.features(extractor, image)
+    assert same(first, extractor.extract(np.array(texture(1))))
+    assert same(first, kept.features(extractor, image))
+    assert image.reads == 1
+    assert len(kept.features(Sift(max_keypoints=3), image)) <= 3  # another extractor
+    assert not same(first, kept.features(extractor, Counted(2)))  # another image
+    assert image.reads == 2
+    for file in (tmp_path / "cache").rglob("*.safetensors"):
+        file.write_bytes(file.read_bytes()[:-9])
+    assert same(first, kept.features(extractor, image))
+    assert image.reads == 3
+    assert "made again" in caplog.text
+
+
+def test_words_of_the_references_are_clustered_to_the_number_asked_for(tmp_path: Path) -> None:
+    place = Place(scene(tmp_path / "scene"), Sift())
+    public = Public(place=place)
+    few, more = public.dictionary("references", 20), public.dictionary("references", 40)
+    assert (len(few), len(more)) == (20, 40)
+    assert not set(map(bytes, few.words)) <= set(map(bytes, more.words))  # not the first of more
+    assert few.digest != more.digest
+    again = Public(place=Place(scene(tmp_path / "scene"), Sift())).dictionary("references", 20)
+    np.testing.assert_array_equal(again.words, few.words)
+    with pytest.raises(UserError, match="too few for 1000000 words"):
+        public.dictionary("references", 1_000_000)
+    with pytest.raises(UserError, match="about no place"):
+        Public().dictionary("references")
+
+
+def test_a_scene_without_queries_is_a_mistake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bare: Scene = dataclasses.replace(scene(tmp_path / "scene"), queries=())
+    monkeypatch.setattr(Gallery, "scene", lambda self: bare)
+    with pytest.raises(UserError, match="has no queries"):
+        units.of_queries(TINY)
