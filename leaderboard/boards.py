@@ -149,9 +149,8 @@ def boards(found: Sequence[Found]) -> list[Board]:
 
 
 def _comparable(record: Record) -> list[Any]:
-    dataset = {key: value for key, value in record["dataset"].items() if key != "name"}
-    task = [record["task"], record.get("task_settings")]
-    return [record["schema"], task, dataset, record["metric_settings"], record["environment"]["source"]]
+    dataset = [record["dataset"][key] for key in ("hash", "extractor")]
+    return [record["schema"], record["task"], dataset, record["metric_settings"], record["environment"]["source"]]
 
 
 def _cells(found: Sequence[Found]) -> list[list[Found]]:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+TRADEOFF = "tradeoff"  # begins the names of the plots that the page draws itself
 ROW = 0.3  # inches a defense
 LETTER = 3.9, 9.0  # points that a letter of a label is wide and high
 
@@ -32,7 +33,7 @@ def plots(board: Board, found: Sequence[Tradeoff]) -> Iterator[tuple[str, Figure
     if curves := _curves(ranked):
         yield "epsilon", epsilon(board, curves)
     for one in found:
-        yield "-".join(filter(None, ("tradeoff", one.condition))), tradeoff(one)
+        yield "-".join(filter(None, (TRADEOFF, one.condition))), tradeoff(one)
 
 
 def tradeoff(found: Tradeoff) -> Figure:

@@ -16,7 +16,7 @@ from bench.records import Record
 from bench.registry import Kind
 from leaderboard.boards import Cell
 
-BUILTIN = "builtin"  # the dataset that needs no --images
+BUILTIN = "builtin"  # the photographs that need no --images
 HERE = "reconstruction", "dia"  # the default task, and what paints the descriptors there
 
 
@@ -39,7 +39,9 @@ def recipe(cell: Cell) -> Recipe:
     if head["attack"] is not None:
         options.append(("--attack", _spec(registry.ATTACK, head["attack"], needs)))
     options.append(("--extractor", _spec(registry.EXTRACTOR, head["dataset"]["extractor"], needs)))
-    if head["dataset"]["name"] != BUILTIN:
+    if head["dataset"].get("spec"):
+        options.append(("--dataset", _spec(registry.DATASET, head["dataset"]["spec"], needs)))
+    elif head["dataset"]["name"] != BUILTIN:
         options.append(("--images", str(head["dataset"]["name"])))
         needs[f"{head['dataset']['name']}: a folder of the photographs with the content {head['dataset']['hash']}"] = None
     seeds = sorted({one.record["seed"] for one in cell.found})

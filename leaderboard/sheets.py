@@ -113,12 +113,13 @@ def shown(column: Column, value: Value) -> str:
 def to_markdown(sheet: Sheet) -> str:
     """The table with its heading, its numbered notes and what the numbers are."""
     notes = _numbered(sheet)
-    lines = [f"**{sheet.heading}**", "", markdown_row(column.label for column in sheet.columns)]
+    lines = [f"**{markdown(sheet.heading)}**", "", markdown_row(column.label for column in sheet.columns)]
     lines.append(markdown_row("---" if column.text else "---:" for column in sheet.columns))
     for row in sheet.rows:
-        cells = [f"**{text}**" if sheet.is_best(column, row) else text for column, text in _texts(sheet, row, notes, "[{}]")]
-        lines.append(markdown_row(cells))
-    lines += ["", *(f"[{place}] {note}  " for note, place in notes.items()), "", *(f"- {line}" for line in sheet.remarks)]
+        texts = ((column, markdown(text)) for column, text in _texts(sheet, row, notes))
+        lines.append(markdown_row(f"**{text}**" if sheet.is_best(column, row) else text for column, text in texts))
+    lines += ["", *(f"{markdown(f'[{place}] {note}')}  " for note, place in notes.items()), ""]
+    lines += [f"- {markdown(line)}" for line in sheet.remarks]
     return "\n".join(lines) + "\n"
 
 
@@ -149,14 +150,17 @@ def to_latex(sheet: Sheet) -> str:
         r"\midrule",
     ]
     for row in sheet.rows:
-        cells = [
-            rf"\textbf{{{latex(text)}}}" if sheet.is_best(column, row) else latex(text)
-            for column, text in _texts(sheet, row, notes, "[{}]")
-        ]
+        texts = ((column, latex(text)) for column, text in _texts(sheet, row, notes))
+        cells = [rf"\textbf{{{text}}}" if sheet.is_best(column, row) else text for column, text in texts]
         lines.append(" & ".join(cells) + r" \\")
     lines += [r"\bottomrule", r"\end{tabular}}", "", r"\smallskip\footnotesize"]
     lines += [rf"{latex(line)}\par" for line in (*(f"[{place}] {note}" for note, place in notes.items()), *sheet.remarks)]
     return "\n".join([*lines, r"\end{minipage}"]) + "\n"
+
+
+def markdown(text: str) -> str:
+    """Text that Markdown shows as it is; the bars of tables are `markdown_row`'s."""
+    return re.sub(r"([\\`*_\[\]<>#~$])", r"\\\1", _one_line(text))
 
 
 def latex(text: str) -> str:
@@ -263,11 +267,11 @@ def _numbered(sheet: Sheet) -> dict[str, int]:
     return {note: place for place, note in enumerate(dict.fromkeys(row.note for row in sheet.rows if row.note), start=1)}
 
 
-def _texts(sheet: Sheet, row: Row, notes: dict[str, int], mark: str) -> Iterable[tuple[Column, str]]:
+def _texts(sheet: Sheet, row: Row, notes: dict[str, int]) -> Iterable[tuple[Column, str]]:
     """The row as text, with the number of its note behind the defense's name."""
     for column in sheet.columns:
         text = shown(column, row.values[column.name])
-        yield column, f"{text} {mark.format(notes[row.note])}" if column.name == "defense" and row.note else text
+        yield column, f"{text} [{notes[row.note]}]" if column.name == "defense" and row.note else text
 
 
 def _exact(value: Value, interval: bool) -> list[str]:

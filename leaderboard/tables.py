@@ -29,6 +29,7 @@ COMPOSED = (
     f"optimal one at δ = {DELTA:g} (Kairouz, Oh and Viswanath). Not covered: {', '.join(UNCOVERED)}."
 )
 SHOWN_FAILURES = 10
+MOST_DIGITS, LARGE = 1e4, 1e7  # numbers between these are written out
 LEFT_TO_FILES = ("MSE", "angle", "l2")  # columns that a terminal has no room for
 
 
@@ -263,8 +264,10 @@ def _count(value: Any) -> str:
 
 
 def number(value: float) -> str:
-    """Four digits; a missing number is n/a."""
-    return NOT_APPLICABLE if math.isnan(value) else "∞" if math.isinf(value) else f"{value:.4g}"
+    """Four digits, and more before the point than that if it must be; a missing number is n/a."""
+    if math.isnan(value) or math.isinf(value):
+        return NOT_APPLICABLE if math.isnan(value) else "∞"
+    return f"{value:.0f}" if MOST_DIGITS <= abs(value) < LARGE else f"{value:.4g}"
 
 
 def chance(log10: float) -> str:

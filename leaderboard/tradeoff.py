@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,6 +26,7 @@ class Point:
     privacy: Interval  # the less the better
     utility: Interval  # the more the better
     best: bool  # on the Pareto front
+    own_words: bool  # whether the two were measured with other dictionaries
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -42,9 +44,11 @@ class Tradeoff:
     def caption(self) -> str:
         """What was measured on what."""
         here, there = self.attacked.head["dataset"], self.served.head["dataset"]
-        together = here["hash"] == there["hash"]
-        places = f"both on {here['name']}" if together else f"attacks on {here['name']}, {self.utility.label} on {there['name']}"
-        return f"{self.condition}, {places}" if self.condition else places
+        condition = f"{self.condition.capitalize()}: " if self.condition else ""
+        if here["hash"] == there["hash"]:
+            return f"{condition}{self.privacy.label} and {self.utility.label} on {here['name']}"
+        words = "; words of a dictionary are those of each" if any(point.own_words for point in self.points) else ""
+        return f"{condition}{self.privacy.label} on {here['name']}, {self.utility.label} on {there['name']}{words}"
 
     @property
     def front(self) -> list[Point]:
@@ -77,23 +81,47 @@ def pareto(cost: ArrayLike, gain: ArrayLike) -> NDArray[np.bool_]:
 
 def _tradeoff(attacked: Board, served: Board, utility: Measure, condition: str | None) -> Tradeoff:
     (privacy,) = measures([PRIVACY])
-    useful = {canonical(cell.head["defense"]): cell for cell in served.cells if not served.missing(cell)}
     pairs = []
     for standing in standings(attacked):
-        cell = useful.get(canonical(standing.configuration))
+        cell, strongest = _same_defense(standing, served), standing.strongest
         gained = served.average(cell, utility, condition) if cell else None
-        if cell and gained and standing.score and standing.strongest:
-            pairs.append((standing, standing.strongest, cell, standing.score, gained))
+        seen = attacked.average(strongest, privacy, condition if condition in attacked.conditions else None) if strongest else None
+        if cell and strongest and gained and seen:
+            pairs.append((standing, strongest, cell, seen, gained))
     ranked = [pair for pair in pairs if pair[0].rank is not None]  # an unranked one may look more private than it is
-    front = pareto([pair[3].mean for pair in ranked], [pair[4].mean for pair in ranked]) if ranked else np.zeros(0, dtype=bool)
+    front = pareto([pair[3].mean for pair in ranked], [pair[4].mean for pair in ranked])
     best = {pair[1].key for pair, on_it in zip(ranked, front, strict=True) if on_it}
     points = tuple(
-        Point(standing=standing, cell=cell, served=other, privacy=score, utility=gained, best=cell.key in best)
-        for standing, cell, other, score, gained in pairs
+        Point(
+            standing=standing,
+            cell=cell,
+            served=other,
+            privacy=seen,
+            utility=gained,
+            best=cell.key in best,
+            own_words=cell.head["defense"] != other.head["defense"],
+        )
+        for standing, cell, other, seen, gained in pairs
     )
-    return Tradeoff(
-        attacked=attacked, served=served, condition=condition, privacy=privacy, utility=utility, points=points
-    )
+    return Tradeoff(attacked=attacked, served=served, condition=condition, privacy=privacy, utility=utility, points=points)
+
+
+def _same_defense(standing: Standing, served: Board) -> Cell | None:
+    """The cell of the same defense with the same setting.
+
+    On other data a defense may have other files, such as the dictionary of the place that is served: there it is the same if all
+    else is, and no second one is so, too.
+    """
+    whole = [cell for cell in served.cells if not served.missing(cell) and not cell.reason]
+    equal = [cell for cell in whole if cell.head["defense"] == standing.configuration]
+    if equal or served.head["dataset"]["hash"] == standing.cells[0].head["dataset"]["hash"]:
+        return equal[0] if equal else None
+    alike = [cell for cell in whole if _without_files(cell.head["defense"]) == _without_files(standing.configuration)]
+    return alike[0] if len(alike) == 1 else None
+
+
+def _without_files(configuration: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: None if str(value).startswith("sha256:") else value for name, value in configuration.items()}
 
 
 def _alike(board: Board) -> str:

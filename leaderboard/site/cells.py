@@ -71,7 +71,7 @@ def view(board: Board, sheet: Sheet, row: Row, found: Sequence[Tradeoff], out: P
     return View(
         row=row,
         label=(name, spaced(fields)),
-        texts={column.name: _parts(column, row.values[column.name]) for column in sheet.columns},
+        texts={column.name: _parts(column, row.values[column.name]) for column in sheet.columns} | {"attack": (spaced(cell.attack), "")},
         values={column.name: _sorted_by(row.values[column.name]) for column in sheet.columns},
         best=frozenset(column.name for column in sheet.columns if sheet.is_best(column, row)),
         pictures=tuple(_pictures(board, cell, out)),
@@ -99,7 +99,7 @@ def _sorted_by(value: Value) -> str:
 
 
 def _pictures(board: Board, cell: Cell, out: Path) -> Iterator[Picture]:
-    for record, files in pictures.every(cell.found, out):
+    for record, files in pictures.pairs(cell.found, out):
         score = record["metrics"].get(PRIVACY)
         unit = record["unit"] if len(board.seeds) == 1 else f"{record['unit']}, seed {record['seed']}"
         yield Picture(unit=unit, score="" if score is None else f"SSIM {number(score)}", files=files)

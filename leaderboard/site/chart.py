@@ -64,20 +64,27 @@ class Scale:
     end: float
 
     def __call__(self, value: float) -> float:
-        within = min(max(value, self.low), self.high)
-        return round(self.start + (within - self.low) / (self.high - self.low) * (self.end - self.start), 1)
+        return round(self.start + (value - self.low) / (self.high - self.low) * (self.end - self.start), 1)
 
     def ticks(self) -> tuple[Tick, ...]:
         from matplotlib.ticker import MaxNLocator
 
-        values = MaxNLocator(TICKS).tick_values(self.low, self.high)
-        return tuple(Tick(at=self(value), text=f"{value:.4g}") for value in values if self.low <= value <= self.high)
+        values = MaxNLocator(TICKS, steps=[1, 2, 5, 10]).tick_values(self.low, self.high)
+        decimals = max(0, -math.floor(math.log10(values[1] - values[0]) + 1e-9))
+        return tuple(Tick(at=self(value), text=f"{value:.{decimals}f}") for value in values if self.low <= value <= self.high)
 
 
-def chart(found: Tradeoff) -> Chart:
-    """Lay the plot out."""
-    x = _scale([point.utility for point in found.points], LEFT, WIDTH - RIGHT)
-    y = _scale([point.privacy for point in found.points], HEIGHT - BOTTOM, TOP)
+def charts(found: Sequence[Tradeoff]) -> list[Chart]:
+    """Lay the plots of one board out, side by side on the same scales, so that they can be compared."""
+    points = [point for one in found for point in one.points]
+    if not points:
+        return []
+    x = _scale([point.utility for point in points], LEFT, WIDTH - RIGHT)
+    y = _scale([point.privacy for point in points], HEIGHT - BOTTOM, TOP)
+    return [_chart(one, x, y) for one in found]
+
+
+def _chart(found: Tradeoff, x: Scale, y: Scale) -> Chart:
     places = [(x(point.utility.mean), y(point.privacy.mean)) for point in found.points]
     texts = settings(found)
     labels = place_labels(
@@ -106,9 +113,12 @@ def chart(found: Tradeoff) -> Chart:
 
 
 def _scale(values: Sequence[Interval], start: float, end: float) -> Scale:
-    low, high = min(value.mean for value in values), max(value.mean for value in values)
-    room = (high - low) * MARGIN or 0.05
-    return Scale(low - room, high + room, start, end)
+    """Of all means and intervals, with some room around the means."""
+    means = [value.mean for value in values]
+    room = (max(means) - min(means)) * MARGIN or 0.05
+    low = min([min(means) - room, *(value.low for value in values if math.isfinite(value.low))])
+    high = max([max(means) + room, *(value.high for value in values if math.isfinite(value.high))])
+    return Scale(low, high, start, end)
 
 
 def _bars(point: Point, x: Scale, y: Scale) -> tuple[tuple[float, float, float, float], ...]:

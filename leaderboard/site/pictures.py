@@ -1,16 +1,16 @@
-"""The photographs and reconstructions of a site: copied once each, small, under names that nobody else chose."""
+"""The photographs and reconstructions of a site: written once each, small, under names that nobody else chose."""
 
 from __future__ import annotations
 
 import functools
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from PIL import Image
 
-from bench import records, runner
+from bench import runner, units
 from bench.datasets import photographs
 from bench.datasets.photographs import Source
 from bench.errors import UnitError
@@ -30,53 +30,48 @@ class Pair:
     original: str | None
 
 
-def pair(found: Found, out: Path) -> Pair | None:
-    """Copy the pictures of a record into the site `out`; None where there is no reconstruction."""
-    made = _copied(_within(found.folder, runner.picture(found.folder, found.record)), out)
-    if made is None:
+def pairs(found: Iterable[Found], out: Path) -> Iterator[tuple[Record, Pair]]:
+    """The records of which there is a reconstruction, with their pictures, which are written into the site `out`."""
+    for one in found:
+        made = _as_it_is(one.folder, runner.picture(one.folder, one.record), out)
+        if made is not None:
+            original = _as_it_is(one.folder, report.photograph(one.folder, one.record), out) or _builtin(one.record, out)
+            yield one.record, Pair(made=made, original=original)
+
+
+def _as_it_is(folder: Path, path: Path, out: Path) -> str | None:
+    """A picture of a folder of results; None if there is none, or a record's names lead out of the folder."""
+    if not path.is_file() or not path.resolve().is_relative_to(folder.resolve()):
         return None
-    kept = _within(found.folder, report.photograph(found.folder, found.record))
-    return Pair(made=made, original=_copied(kept, out) or _copied(_builtin(found.record), out))
+    return _written(path.read_bytes(), lambda: photographs.decode(path)[0], out)
 
 
-def _within(folder: Path, path: Path) -> Path | None:
-    """The path, unless a record's names lead out of the record's folder."""
-    return path if path.resolve().is_relative_to(folder.resolve()) else None
-
-
-def _copied(path: Path | None, out: Path) -> str | None:
-    """Write the picture as WebP, named by its content, unless that was done before; the name, or None if there is no picture."""
-    if path is None or not path.is_file():
+def _builtin(record: Record, out: Path) -> str | None:
+    """A photograph that every installation has, cut out as attacks see it."""
+    sources, content = _all_builtin()
+    if record["dataset"]["hash"] != content or record["unit"] not in sources:
         return None
-    name = f"{FOLDER}/{hashlib.sha256(path.read_bytes()).hexdigest()[:24]}.webp"
+    path = sources[record["unit"]].path
+    return _written(b"cut out " + path.read_bytes(), lambda: Image.fromarray(photographs.read(path).pixels), out)
+
+
+def _written(content: bytes, read: Callable[[], Image.Image], out: Path) -> str | None:
+    """Write a picture as WebP, named by its content, unless that was done before; None if it cannot be read."""
+    name = f"{FOLDER}/{hashlib.sha256(content).hexdigest()[:24]}.webp"
     if not (out / name).is_file():
         try:
-            pixels = photographs.read(path).pixels
+            image = read()
         except UnitError:
             return None
         unfinished = (out / name).with_suffix(".unfinished")
         unfinished.parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(pixels).save(unfinished, "WEBP", quality=QUALITY)
+        image.save(unfinished, "WEBP", quality=QUALITY)
         unfinished.replace(out / name)
     return name
 
 
-def _builtin(record: Record) -> Path | None:
-    """A photograph that every installation has."""
-    sources, content = _all_builtin()
-    same = record["dataset"]["hash"] == content
-    return next((source.path for source in sources if same and source.name == record["unit"]), None)
-
-
 @functools.cache
-def _all_builtin() -> tuple[list[Source], str]:
-    sources = photographs.builtin()
-    hashes = {source.name: source.content_hash() for source in sources}
-    return sources, "sha256:" + hashlib.sha256(records.canonical(hashes).encode()).hexdigest()
-
-
-def every(found: tuple[Found, ...], out: Path) -> Iterator[tuple[Record, Pair]]:
-    """The records of a cell that have a picture, with the pictures."""
-    for one in found:
-        if one.record["status"] == "ok" and (pictures := pair(one, out)):
-            yield one.record, pictures
+def _all_builtin() -> tuple[dict[str, Source], str]:
+    """By name, and the hash that records know them by."""
+    sources = {source.name: source for source in photographs.builtin()}
+    return sources, units.digest({name: source.content_hash() for name, source in sources.items()})

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from bench.environment import DISTRIBUTION
 from bench.progress import Progress
@@ -19,8 +19,11 @@ from leaderboard.boards import Board
 from leaderboard.reproduce.drawing import save
 from leaderboard.sheets import Sheet
 from leaderboard.site import cells
-from leaderboard.site.chart import chart
+from leaderboard.site.chart import charts
 from leaderboard.tradeoff import Tradeoff, tradeoffs
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 PAGE = "index.html"
 WRITERS: dict[str, Callable[[Sheet], str]] = {"md": sheets.to_markdown, "csv": sheets.to_csv, "tex": sheets.to_latex}
@@ -72,9 +75,9 @@ def _board(board: Board, every: Sequence[Board], out: Path, progress: Progress) 
         "sheet": sheet,
         "columns": cells.columns(sheet),
         "cells": shown,
-        "charts": [chart(one) for one in found],
+        "charts": charts(found),
         "tables": [_tables(table, f"{name}-{kind}", out) for kind, table in tables.items()],
-        "plots": [_plots(f"{name}-{kind}", figure, out) for kind, figure in (plots.plots(board, found) if board.attacked else ())],
+        "plots": [_plot(name, kind, figure, out) for kind, figure in (plots.plots(board, found) if board.attacked else ())],
     }
 
 
@@ -86,8 +89,9 @@ def _tables(sheet: Sheet, name: str, out: Path) -> dict[str, str]:
     return {suffix: f"tables/{name}.{suffix}" for suffix in WRITERS}
 
 
-def _plots(name: str, figure: Any, out: Path) -> dict[str, str]:
-    return {path.suffix[1:]: path.relative_to(out).as_posix() for path in save(figure, out / "plots" / name)}
+def _plot(name: str, kind: str, figure: Figure, out: Path) -> dict[str, Any]:
+    files = {path.suffix[1:]: path.relative_to(out).as_posix() for path in save(figure, out / "plots" / f"{name}-{_plain(kind)}")}
+    return files | {"name": kind.replace("-", ", "), "interactive": kind.startswith(plots.TRADEOFF)}
 
 
 def _page(shown: Sequence[dict[str, Any]], records: int) -> str:
@@ -121,5 +125,8 @@ def _hash(text: str) -> str:
 
 def _file_name(board: Board) -> str:
     """Of letters that every system takes, and told apart by the key."""
-    words = [board.head["task"], board.head["dataset"]["name"]]
-    return "-".join([*(re.sub(r"[^a-z0-9]+", "-", word.lower()).strip("-")[:30] for word in words), board.key[:8]])
+    return "-".join([_plain(board.head["task"]), _plain(board.head["dataset"]["name"]), board.key[:8]])
+
+
+def _plain(text: str) -> str:
+    return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")[:30]
