@@ -367,7 +367,9 @@ def _shot(plan: Plan, cell: Cell, unit: Unit, number: int, seen: _Observed) -> S
     """The release of one image of a unit: that of the first is a function of its content alone."""
     content = plan.hashes[unit.name] if len(unit.images) == 1 else seen.image.content_hash()
     release = _protect(plan, cell, seen.features, content)
-    return Shot(pixels=seen.pixels, secret=seen.features, release=release)
+    return Shot(
+        pixels=seen.pixels, secret=seen.features, release=release, foreground=functools.partial(units.foreground, seen.image)
+    )
 
 
 def _protect(plan: Plan, cell: Cell, features: Features, content: str, *repetition: int) -> Release:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from bench import fields, registry, spec, units
+from bench.datasets.scene import Mask
 from bench.errors import UnitError, UserError, blamed
 from bench.plugin import (
     Attack,
@@ -19,8 +20,11 @@ from bench.plugin import (
     DescriptorAttack,
     Extractor,
     ImageAttack,
+    LocalMetric,
     Metric,
     Outcome,
+    Selection,
+    SelectiveAttack,
     Task,
     Trial,
     View,
@@ -66,7 +70,7 @@ class Reconstruction(Task):
             if what in attack.needs:
                 load()
         digests = dict(attack.assets(defense, extractor, public))
-        if not isinstance(attack, DescriptorAttack):
+        if isinstance(attack, ImageAttack):
             return digests
         inverter, undefended, reason = self._inverter(extractor, public)
         if reason is not None:
@@ -75,15 +79,16 @@ class Reconstruction(Task):
 
     def judge(self, trial: Trial) -> Outcome:
         attack = trial.attack
+        if attack is None:
+            raise UnitError("reconstruction needs an attack")
         if isinstance(attack, ImageAttack):
             return compared(trial, None, reconstructed(attack, view(trial), trial.rng))
-        if not isinstance(attack, DescriptorAttack):
-            raise UnitError("reconstruction needs an attack")
         found, told = recovered(attack, trial)
         inverter, undefended, reason = self._inverter(trial.extractor, trial.public)
         if reason is not None:
             return compared(trial, found, None, (*told, f"no image: {reason}"))
-        release = Descriptors(keypoints=trial.release.keypoints, size=trial.release.size, descriptors=found)
+        keypoints = trial.release.keypoints[found.rows]
+        release = Descriptors(keypoints=keypoints, size=trial.release.size, descriptors=found.descriptors)
         seen = view(dataclasses.replace(trial.released(release), attack=inverter, defense=undefended))
         return compared(trial, found, reconstructed(inverter, seen, trial.rng), told)
 
@@ -136,28 +141,49 @@ def reconstructed(attack: ImageAttack, seen: View, rng: np.random.Generator) -> 
     return image
 
 
-def recovered(attack: DescriptorAttack, trial: Trial) -> tuple[Floats, tuple[str, ...]]:
-    """The attacker's descriptors, (N, D), and what he says of them."""
-    seen = view(trial)
+def recovered(attack: Attack, trial: Trial) -> tuple[Selection, tuple[str, ...]]:
+    """The attacker's descriptors, and what he says of them."""
+    seen, everything = view(trial), trial.secret.descriptors
     with blamed(f"plugin {attack.name()}"):
-        descriptors = attack.recover(seen, trial.rng)
-        _expect(descriptors, trial.secret.descriptors.shape)
-    return descriptors, tuple(map(str, seen.notes))
+        if isinstance(attack, SelectiveAttack):
+            found = attack.select(seen, trial.rng)
+            _expect(found.descriptors, everything[found.rows].shape)
+        elif isinstance(attack, DescriptorAttack):
+            found = Selection(rows=np.arange(len(everything)), descriptors=attack.recover(seen, trial.rng))
+            _expect(found.descriptors, everything.shape)
+        else:
+            raise TypeError(f"{attack.name()} recovers neither descriptors nor images")
+    return found, tuple(map(str, seen.notes))
 
 
-def compared(trial: Trial, descriptors: Floats | None, image: Floats | None, notes: tuple[str, ...] = ()) -> Outcome:
-    """Every metric of what was recovered; None for a metric of what was not."""
+def compared(trial: Trial, found: Selection | None, image: Floats | None, notes: tuple[str, ...] = ()) -> Outcome:
+    """Every metric of what was recovered; None for a metric of what was not. Of an image with a foreground, its parts as well."""
+    values: dict[str, float | None] = {}
     truth = (trial.pixels() / 255.0).astype(np.float32)
-    values = {metric.name(): _measured(metric, trial.secret.descriptors, truth, descriptors, image) for metric in trial.metrics}
+    for metric in trial.metrics:
+        if metric.compares == "images":
+            values[metric.name()] = None if image is None else _measured(metric, truth, image)
+        else:
+            described = None if found is None else _measured(metric, trial.secret.descriptors[found.rows], found.descriptors)
+            values[metric.name()] = described
+    if image is not None and (mask := trial.shots[0].foreground()) is not None:
+        values |= parts(trial.metrics, truth, image, mask)
     return Outcome(metrics=values, image=image, notes=notes)
 
 
-def _measured(
-    metric: Metric, true_descriptors: Floats, true_image: Floats, descriptors: Floats | None, image: Floats | None
-) -> float | None:
-    truth, estimate = (true_image, image) if metric.compares == "images" else (true_descriptors, descriptors)
-    if estimate is None:
-        return None
+def parts(metrics: Sequence[Metric], truth: Floats, image: Floats, mask: Mask) -> dict[str, float | None]:
+    """Those metrics that can be told for each pixel, over the foreground and over the rest; None for an empty part."""
+    values: dict[str, float | None] = {}
+    for metric in metrics:
+        if isinstance(metric, LocalMetric):
+            with blamed(f"plugin {metric.name()}"):
+                each = metric.local(truth, image)  # (H, W)
+            for part, inside in (("foreground", mask), ("background", ~mask)):
+                values[f"{metric.name()}_{part}"] = float(each[inside].mean()) if inside.any() else None
+    return values
+
+
+def _measured(metric: Metric, truth: Floats, estimate: Floats) -> float | None:
     with blamed(f"plugin {metric.name()}"):
         value = metric(truth, estimate)
         if value is not None and not np.isfinite(value):

@@ -1,4 +1,4 @@
-"""How sure a mean over photographs is: percentile bootstrap (Efron 1979); and a share of queries: Wilson's interval (1927)."""
+"""How sure a mean over units is: percentile bootstrap (Efron 1979), and for a share, Wilson's interval."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
-from scipy.stats import norm
+from scipy.stats import binomtest
 
 LEVEL = 0.95
 RESAMPLES = 10_000
@@ -23,7 +23,7 @@ class Interval:
     mean: float
     low: float
     high: float
-    count: int  # photographs
+    count: int  # units, such as photographs
 
 
 def interval(values: ArrayLike) -> Interval:
@@ -40,18 +40,23 @@ def interval(values: ArrayLike) -> Interval:
     return Interval(float(sample.mean()), float(low), float(high), len(sample))
 
 
-def share(values: ArrayLike) -> Interval:
-    """The mean of (n,) values that are 0 or 1, one a query, n at least 1, with Wilson's interval, which holds near 0 and 1, too.
+def independent(samples: Sequence[ArrayLike], weights: Sequence[float]) -> Interval:
+    """Σ weight · mean of samples that have nothing to do with each other, each resampled by itself; `count` is the smallest's."""
+    total, resampled = 0.0, np.zeros(RESAMPLES)
+    for rng, values, weight in zip(np.random.default_rng(SEED).spawn(len(samples)), samples, weights, strict=True):
+        sample = np.asarray(values, dtype=np.float64)
+        drawn = rng.integers(len(sample), size=(RESAMPLES, len(sample)))
+        total += weight * float(sample.mean())
+        resampled += weight * sample[drawn].mean(axis=1)
+    low, high = np.quantile(resampled, ((1 - LEVEL) / 2, (1 + LEVEL) / 2))
+    return Interval(total, float(low), float(high), min(len(np.asarray(values)) for values in samples))
 
-    Values between, where a query was tried with several seeds and succeeded with some, count as so much of a success; n stays
-    the number of queries, so the interval is no narrower for it.
-    """
-    sample = np.asarray(values, dtype=np.float64)
-    mean, count = float(sample.mean()), len(sample)
-    z = float(norm.ppf((1 + LEVEL) / 2))
-    centre = (mean + z**2 / (2 * count)) / (1 + z**2 / count)
-    reach = z / (1 + z**2 / count) * math.sqrt(mean * (1 - mean) / count + z**2 / (4 * count**2))
-    return Interval(mean, max(0.0, centre - reach), min(1.0, centre + reach), count)
+
+def proportion(hits: ArrayLike, times: float = 1.0) -> Interval:
+    """The share of (n,) trials, each 1 or 0, that are hits, with Wilson's interval (1927); all multiplied by `times`."""
+    sample = np.asarray(hits, dtype=np.float64)
+    found = binomtest(int(sample.sum()), len(sample)).proportion_ci(LEVEL, method="wilson")
+    return Interval(float(sample.mean()) * times, float(found.low) * times, float(found.high) * times, len(sample))
 
 
 def rank_correlation(one: Sequence[float], other: Sequence[float]) -> float:
