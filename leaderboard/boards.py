@@ -144,7 +144,9 @@ def boards(found: Sequence[Found]) -> list[Board]:
             shared = [cell for cell in together if {one.record["seed"] for one in cell} == set(seeds)]
             made += [_board(shared, seeds)] if shared else []
         for seed in seeds:
-            made.append(_board([part for cell in together if (part := [one for one in cell if one.record["seed"] == seed])], (seed,)))
+            made.append(
+                _board([part for cell in together if (part := [one for one in cell if one.record["seed"] == seed])], (seed,))
+            )
     return sorted(made, key=lambda board: (not board.attacked, board.head["task"], board.head["dataset"]["name"]))
 
 
@@ -167,7 +169,7 @@ def _board(cells: Sequence[Sequence[Found]], seeds: tuple[int, ...]) -> Board:
     )
     done = [record for cell in made for record in cell.done]
     named = {name for record in done for name, value in record["metrics"].items() if value is not None}
-    conditions = tuple(sorted({record.get("condition") for record in done} - {None})) or (None,)
+    conditions = tuple(sorted({str(told) for record in done if (told := record.get("condition")) is not None})) or (None,)
     return Board(
         cells=made,
         seeds=seeds,

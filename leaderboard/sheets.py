@@ -235,9 +235,7 @@ def _row(board: Board, columns: Sequence[Column], cell: Cell, standing: Standing
         "attack": cell.attack,
         "log10_true": None if privacy["log10_true"] is None else float(privacy["log10_true"]),
         "units": whole,
-    } | {
-        _name(measure, condition): board.average(cell, measure, condition) for measure, condition in _measured(board)
-    }
+    } | {_name(measure, condition): board.average(cell, measure, condition) for measure, condition in _measured(board)}
     strongest = standing is not None and cell is (standing.strongest or standing.cells[0])
     return Row(
         values={column.name: values[column.name] for column in columns},
@@ -308,7 +306,6 @@ _LATEX = {letter: f"\\{letter}" for letter in "{}$&#_%"} | {
     "τ": r"$\tau$",
     "∞": r"$\infty$",
     "°": r"$^\circ$",
-    "−": "$-$",
     "`": r"\textasciigrave{}",
     "[": "{[}",  # so that a row which begins with it is not read as an argument of the line before
     "]": "{]}",

@@ -76,7 +76,8 @@ def pareto(cost: ArrayLike, gain: ArrayLike) -> NDArray[np.bool_]:
     costs, gains = np.asarray(cost, dtype=np.float64), np.asarray(gain, dtype=np.float64)
     no_worse = (costs[None] <= costs[:, None]) & (gains[None] >= gains[:, None])
     better = (costs[None] < costs[:, None]) | (gains[None] > gains[:, None])
-    return ~(no_worse & better).any(axis=1)
+    dominated: NDArray[np.bool_] = (no_worse & better).any(axis=1)
+    return ~dominated
 
 
 def _tradeoff(attacked: Board, served: Board, utility: Measure, condition: str | None) -> Tradeoff:
@@ -85,7 +86,9 @@ def _tradeoff(attacked: Board, served: Board, utility: Measure, condition: str |
     for standing in standings(attacked):
         cell, strongest = _same_defense(standing, served), standing.strongest
         gained = served.average(cell, utility, condition) if cell else None
-        seen = attacked.average(strongest, privacy, condition if condition in attacked.conditions else None) if strongest else None
+        seen = (
+            attacked.average(strongest, privacy, condition if condition in attacked.conditions else None) if strongest else None
+        )
         if cell and strongest and gained and seen:
             pairs.append((standing, strongest, cell, seen, gained))
     ranked = [pair for pair in pairs if pair[0].rank is not None]  # an unranked one may look more private than it is

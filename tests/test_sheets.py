@@ -137,4 +137,7 @@ def test_tables_of_a_server_are_led_by_what_it_is_judged_by(tmp_path: Path) -> N
     assert "attack" not in names
     assert names.index("recall_0.25m_2deg_day") < names.index("translation_error_day") < names.index("inliers")
     assert [row.values["defense"] for row in sheet.rows] == ["none", "ldp:epsilon=8,subset_size=2"]
-    assert [sheet.is_best(next(c for c in sheet.columns if c.name == "recall_0.25m_2deg_day"), row) for row in sheet.rows] == [True, False]
+    assert [sheet.is_best(next(c for c in sheet.columns if c.name == "recall_0.25m_2deg_day"), row) for row in sheet.rows] == [
+        True,
+        False,
+    ]

@@ -1,4 +1,4 @@
-"""What the page shows of one cell: its numbers, pictures, budget, configuration, environment and the command that makes it again."""
+"""What the page shows of one cell: numbers, pictures, budget, configuration, environment, and the command that makes it again."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from typing import Any
 
 from bench.composition import DELTA
 from leaderboard.boards import Board, Cell
-from leaderboard.recipe import Recipe, recipe
 from leaderboard.measures import PRIVACY
+from leaderboard.recipe import Recipe, recipe
 from leaderboard.reproduce.intervals import Interval
 from leaderboard.sheets import Column, Row, Sheet, Value, guarantee, middle, shown
 from leaderboard.site import pictures
@@ -58,9 +58,7 @@ def columns(sheet: Sheet) -> list[Column]:
     """Those that the page's table shows: what is judged, and what says of what it is."""
     head = ("rank", "defense", "guarantee", "epsilon_descriptor", "epsilon_image", "attack")
     return [
-        column
-        for column in sheet.columns
-        if column.name in (*head, "units") or (column.better and column.name not in UNTOLD)
+        column for column in sheet.columns if column.name in (*head, "units") or (column.better and column.name not in UNTOLD)
     ]
 
 
@@ -71,7 +69,8 @@ def view(board: Board, sheet: Sheet, row: Row, found: Sequence[Tradeoff], out: P
     return View(
         row=row,
         label=(name, spaced(fields)),
-        texts={column.name: _parts(column, row.values[column.name]) for column in sheet.columns} | {"attack": (spaced(cell.attack), "")},
+        texts={column.name: _parts(column, row.values[column.name]) for column in sheet.columns}
+        | {"attack": (spaced(cell.attack), "")},
         values={column.name: _sorted_by(row.values[column.name]) for column in sheet.columns},
         best=frozenset(column.name for column in sheet.columns if sheet.is_best(column, row)),
         pictures=tuple(_pictures(board, cell, out)),

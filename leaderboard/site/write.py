@@ -20,7 +20,7 @@ from leaderboard.reproduce.drawing import save
 from leaderboard.sheets import Sheet
 from leaderboard.site import cells
 from leaderboard.site.chart import charts
-from leaderboard.tradeoff import Tradeoff, tradeoffs
+from leaderboard.tradeoff import tradeoffs
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
