@@ -7,6 +7,7 @@ more, where each unit counts with its mean over the seeds. Runs of one cell in s
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -126,9 +127,12 @@ def find(results: Path) -> list[Found]:
         if there is none, or a file is damaged; the message names the file and the line.
     """
     paths = sorted(results.rglob(FILE)) if results.is_dir() else [files.find(results)]
-    latest = {
-        (record["run_hash"], record["unit"]): Found(record, path.parent) for path in paths for record in files.read(path).records
-    }
+    latest = {}
+    for path in paths:
+        contents = files.read(path)
+        if contents.notice:
+            logging.getLogger(__name__).warning(contents.notice)
+        latest |= {(record["run_hash"], record["unit"]): Found(record, path.parent) for record in contents.records}
     if not latest:
         raise UserError(f"--results {results}: there is no record in it (looked for files called {FILE})")
     return list(latest.values())

@@ -76,8 +76,7 @@ def pareto(cost: ArrayLike, gain: ArrayLike) -> NDArray[np.bool_]:
     costs, gains = np.asarray(cost, dtype=np.float64), np.asarray(gain, dtype=np.float64)
     no_worse = (costs[None] <= costs[:, None]) & (gains[None] >= gains[:, None])
     better = (costs[None] < costs[:, None]) | (gains[None] > gains[:, None])
-    dominated: NDArray[np.bool_] = (no_worse & better).any(axis=1)
-    return ~dominated
+    return np.logical_not(np.logical_and(no_worse, better).any(axis=1))
 
 
 def _tradeoff(attacked: Board, served: Board, utility: Measure, condition: str | None) -> Tradeoff:

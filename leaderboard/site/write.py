@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bench.environment import DISTRIBUTION
+from bench.errors import UserError
 from bench.progress import Progress
 from leaderboard import boards, plots, sheets
 from leaderboard.boards import Board
@@ -45,13 +46,16 @@ def write(results: Path, out: Path) -> Done:
     Raises
     ------
     UserError
-        if there is no record, or a damaged one; nothing has been written then.
+        if there is no record, or a damaged one, or `out` is no folder; nothing has been written then.
     OSError
         if it cannot be written.
     """
     found = boards.find(results)
     made = boards.boards(found)
-    out.mkdir(parents=True, exist_ok=True)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"--out: cannot write {out}: {error.strerror}") from error
     count = sum(len(board.cells) for board in made)
     with Progress(f"{len(made)} boards, {count} cells", count) as progress:
         shown = [_board(board, made, out, progress) for board in made]
