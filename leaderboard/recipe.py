@@ -44,6 +44,7 @@ def recipe(cell: Cell) -> Recipe:
     elif head["dataset"]["name"] != BUILTIN:
         options.append(("--images", str(head["dataset"]["name"])))
         needs[f"{head['dataset']['name']}: a folder of the photographs with the content {head['dataset']['hash']}"] = None
+    options += [("--metric", text) for text in _metrics(head["metric_settings"], needs)]
     seeds = sorted({one.record["seed"] for one in cell.found})
     default = {"--task": HERE[0], "--extractor": "sift"}
     words = ["bench run", *(_option(option, text) for option, text in options if default.get(option) != text)]
@@ -59,6 +60,14 @@ def _task(head: Record) -> str:
     inversion = (head["attack"] or {}).get("inversion")
     painter = inversion["name"] if inversion else HERE[1]
     return str(head["task"]) if painter == HERE[1] else f"{head['task']}:inverter={painter}"
+
+
+def _metrics(settings: Mapping[str, Mapping[str, Any]], needs: dict[str, None]) -> Iterator[str]:
+    """Those that are measured only where they are asked for."""
+    for name, content in settings.items():
+        plugin = _installed(registry.METRIC, name)
+        if plugin and fields.without_default(plugin):
+            yield _spec(registry.METRIC, {"name": name, **content}, needs)
 
 
 def _spec(kind: Kind, configuration: Mapping[str, Any], needs: dict[str, None]) -> str:
