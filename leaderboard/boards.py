@@ -127,7 +127,7 @@ def find(results: Path) -> list[Found]:
         if there is none, or a file is damaged; the message names the file and the line.
     """
     paths = sorted(results.rglob(FILE)) if results.is_dir() else [files.find(results)]
-    latest = {}
+    latest: dict[tuple[str, str], Found] = {}
     for path in paths:
         contents = files.read(path)
         if contents.notice:

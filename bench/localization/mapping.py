@@ -62,9 +62,7 @@ def build(references: Sequence[Reference], features: Sequence[Features]) -> Map:
     )
 
 
-def verified(
-    references: Sequence[Reference], features: Sequence[Features], matches: Iterable[tuple[tuple[int, int], Indices]]
-) -> Matches:
+def verified(references: Sequence[Reference], features: Sequence[Features], matches: Iterable[tuple[tuple[int, int], Indices]]) -> Matches:
     """The matches that agree with the known poses."""
     rays = [_rays(reference, each) for reference, each in zip(references, features, strict=True)]
     kept = {}

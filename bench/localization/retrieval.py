@@ -13,6 +13,7 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
+from bench.localization.maps import Map
 from bench.types import Indices
 
 TOP = 20  # references of a query (the paper's Sec. 6.2)
@@ -55,7 +56,7 @@ class Bags:
         -------
         (min(count, V),) int64
         """
-        bag = np.bincount(words.ravel(), minlength=self.size) * self.weights  # (K,)
+        bag = np.bincount(words.ravel(), minlength=self.size) * self.weights  # (K,) 
         return np.argsort(-(self._rows @ bag), kind="stable")[:count]
 
 
