@@ -7,6 +7,7 @@ more, where each unit counts with its mean over the seeds. Runs of one cell in s
 
 from __future__ import annotations
 
+import functools
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -54,9 +55,17 @@ class Cell:
         """Why it does not apply, if it does not."""
         return self.head["reason"] if self.head["status"] == "n/a" else None
 
-    @property
+    @functools.cached_property
     def done(self) -> list[Record]:
         return [one.record for one in self.found if one.record["status"] == "ok"]
+
+    @functools.cached_property
+    def by_unit(self) -> list[list[Record]]:
+        """What is done, together for each unit."""
+        units: dict[str, list[Record]] = {}
+        for record in self.done:
+            units.setdefault(record["unit"], []).append(record)
+        return list(units.values())
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -101,8 +110,7 @@ class Board:
 
     def whole(self, cell: Cell) -> list[list[Record]]:
         """The records of each unit that the cell has done with every seed."""
-        by_unit = _grouped(cell.done, lambda record: record["unit"])
-        return [group for group in by_unit if len(group) == len(self.seeds)]
+        return [group for group in cell.by_unit if len(group) == len(self.seeds)]
 
     def values(self, cell: Cell, metric: str, condition: str | None = None) -> list[float | None]:
         """The value of each such unit, averaged over the seeds; of those of one condition if it is given."""

@@ -11,7 +11,7 @@ from typing import Any
 from bench.composition import DELTA
 from leaderboard.boards import Board, Cell
 from leaderboard.measures import PRIVACY
-from leaderboard.recipe import Recipe, recipe
+from leaderboard.recipe import Lookup, Recipe, recipe
 from leaderboard.reproduce.intervals import Interval
 from leaderboard.sheets import Column, Row, Sheet, Value, guarantee, middle, shown
 from leaderboard.site import pictures
@@ -62,33 +62,31 @@ def columns(sheet: Sheet) -> list[Column]:
     ]
 
 
-def view(board: Board, sheet: Sheet, row: Row, found: Sequence[Tradeoff], out: Path) -> View:
+def view(board: Board, sheet: Sheet, row: Row, found: Sequence[Tradeoff], out: Path, lookup: Lookup) -> View:
     """Gather what there is to show of a row of the board, and copy its pictures into `out`."""
     cell = row.cell
     name, _, fields = cell.defense.partition(":")
     return View(
         row=row,
         label=(name, spaced(fields)),
-        texts={column.name: _parts(column, row.values[column.name]) for column in sheet.columns}
-        | {"attack": (spaced(cell.attack), "")},
+        texts={column.name: _parts(column, row) for column in sheet.columns} | {"attack": (spaced(cell.attack), "")},
         values={column.name: _sorted_by(row.values[column.name]) for column in sheet.columns},
         best=frozenset(column.name for column in sheet.columns if sheet.is_best(column, row)),
         pictures=tuple(_pictures(board, cell, out)),
         budget=tuple(_budget(cell)),
         uncovered=tuple(map(str, cell.head["privacy"].get("uncovered", ()))),
-        recipe=recipe(cell),
+        recipe=recipe(cell, lookup),
         settings=tuple(_settings(cell)),
         failures=tuple(_failures(cell)),
         beside=tuple(_beside(cell, found)),
     )
 
 
-def _parts(column: Column, value: Value) -> tuple[str, str]:
+def _parts(column: Column, row: Row) -> tuple[str, str]:
     """The number, and its interval if it has one."""
-    if not isinstance(value, Interval):
-        return shown(column, value), ""
-    mean, _, ends = shown(column, value).partition(" ")
-    return mean, ends
+    text = shown(column, row)
+    mean, _, ends = text.partition(" ")
+    return (mean, ends) if isinstance(row.values[column.name], Interval) else (text, "")
 
 
 def _sorted_by(value: Value) -> str:
