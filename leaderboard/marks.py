@@ -1,6 +1,6 @@
 """How families of defenses are told apart in a plot: by the shapes of marks and the styles of lines first, by colour last.
 
-The colours are Okabe and Ito's, which people with any kind of colour blindness can tell, in an order that also differs in grey.
+The colours are Okabe and Ito's, which people with any kind of colour blindness can tell.
 """
 
 from __future__ import annotations

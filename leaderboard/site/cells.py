@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -85,8 +86,10 @@ def view(board: Board, sheet: Sheet, row: Row, found: Sequence[Tradeoff], out: P
 def _parts(column: Column, row: Row) -> tuple[str, str]:
     """The number, and its interval if it has one."""
     text = shown(column, row)
+    if not isinstance(row.values[column.name], Interval):
+        return text, ""
     mean, _, ends = text.partition(" ")
-    return (mean, ends) if isinstance(row.values[column.name], Interval) else (text, "")
+    return mean, ends.replace(", ", ",\N{NO-BREAK SPACE}").replace(" = ", "\N{NO-BREAK SPACE}=\N{NO-BREAK SPACE}")
 
 
 def _sorted_by(value: Value) -> str:
@@ -143,7 +146,12 @@ def _flat(content: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, s
         if isinstance(value, Mapping):
             yield from _flat(value, f"{before}{name}.")
         else:
-            yield f"{before}{name}", ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+            yield f"{before}{name}", ", ".join(map(_plain, value)) if isinstance(value, list) else _plain(value)
+
+
+def _plain(value: Any) -> str:
+    """As records hold it."""
+    return value if isinstance(value, str) else json.dumps(value)
 
 
 def _failures(cell: Cell) -> Iterator[str]:
