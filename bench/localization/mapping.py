@@ -1,4 +1,4 @@
-"""Makes the map: features of the references, matches among neighbours, and points triangulated from the known poses.
+"""Makes the map of a place: matches among neighbouring references, and points triangulated from their known poses.
 
 A match is kept if it agrees with the poses: COLMAP's Sampson error of at most `EPIPOLAR` pixels. What is left goes through
 `pycolmap.Database` to COLMAP's triangulation, in one thread and with a seed, so that the same images make the same map.
@@ -17,27 +17,17 @@ import torch
 from bench.datasets.scene import Reference
 from bench.device import pick_device
 from bench.errors import UserError
+from bench.kernels.distances import mutual, points_to_points
 from bench.localization import covisible
 from bench.localization.maps import Map
-from bench.localization.nearest import between_points, mutual
-from bench.plugin import Extractor
 from bench.progress import Progress
+from bench.quietly import quietly
 from bench.types import Features, Indices
 
 RATIO = 0.8  # of the ratio test among references
 EPIPOLAR = 4.0  # pixels
 
 Matches = dict[tuple[int, int], Indices]  # references a < b -> (M, 2) keypoints of a, of b
-
-
-def extract(references: Sequence[Reference], extractor: Extractor) -> list[Features]:
-    """The features of full-size images, one after the other; raises UnitError where there is no keypoint."""
-    found = []
-    with Progress("map: features", len(references)) as progress:
-        for reference in references:
-            found.append(extractor.extract(reference.pixels.read()))
-            progress.advance()
-    return found
 
 
 def build(references: Sequence[Reference], features: Sequence[Features]) -> Map:
@@ -52,17 +42,21 @@ def build(references: Sequence[Reference], features: Sequence[Features]) -> Map:
     points, xyz = triangulate(references, features, matches)
     if len(xyz) == 0:
         raise UserError("the map has no point: do the references overlap?")
+    codes = [each.codes for each in features if each.codes is not None]
     return Map(
         names=tuple(reference.name for reference in references),
         starts=np.concatenate([[0], np.cumsum([len(each) for each in features])]).astype(np.int64),
         keypoints=np.concatenate([each.keypoints for each in features]),
-        stored=np.concatenate([each.descriptors if each.codes is None else each.codes for each in features]),
+        descriptors=np.concatenate([each.descriptors for each in features]),
+        codes=np.concatenate(codes) if len(codes) == len(features) else None,
         points=points,
         xyz=xyz,
     )
 
 
-def verified(references: Sequence[Reference], features: Sequence[Features], matches: Iterable[tuple[tuple[int, int], Indices]]) -> Matches:
+def verified(
+    references: Sequence[Reference], features: Sequence[Features], matches: Iterable[tuple[tuple[int, int], Indices]]
+) -> Matches:
     """The matches that agree with the known poses."""
     rays = [_rays(reference, each) for reference, each in zip(references, features, strict=True)]
     kept = {}
@@ -76,7 +70,7 @@ def verified(references: Sequence[Reference], features: Sequence[Features], matc
 
 def triangulate(references: Sequence[Reference], features: Sequence[Features], matches: Matches) -> tuple[Indices, np.ndarray]:
     """COLMAP's points. -> (T,) point of each keypoint of all references, or -1; (P, 3)"""
-    with tempfile.TemporaryDirectory() as scratch:
+    with tempfile.TemporaryDirectory() as scratch, quietly():
         database = Path(scratch) / "database.db"
         model = _prepared(database, references, features, matches)
         options = pycolmap.IncrementalPipelineOptions(num_threads=1, random_seed=0, extract_colors=False)
@@ -96,7 +90,7 @@ def _matched(features: Sequence[Features], pairs: Sequence[tuple[int, int]]) -> 
     rows = [torch.from_numpy(each.descriptors).to(device) for each in features]
     with Progress("map: matches", len(pairs)) as progress:
         for a, b in pairs:
-            yield (a, b), np.stack(mutual(between_points(rows[a], rows[b]), RATIO), axis=1)
+            yield (a, b), np.stack(mutual(points_to_points(rows[a], rows[b]), RATIO), axis=1)
             progress.advance()
 
 
@@ -126,4 +120,4 @@ def _prepared(
 
 def _rays(reference: Reference, features: Features) -> np.ndarray:
     """Where the keypoints lie on the plane at depth one. -> (N, 2) float64"""
-    return reference.camera.cam_from_img(features.keypoints.astype(np.float64))
+    return np.asarray(reference.camera.cam_from_img(features.keypoints.astype(np.float64)))

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.errors import UserError
 from bench.kernels.search import unit_rows
 from bench.tensorfile import Arrays
 from bench.types import Bytes, Floats, Indices
@@ -24,48 +23,34 @@ class Map:
     names: tuple[str, ...]  # (V,) of the references
     starts: Indices  # (V + 1,) keypoints starts[v] up to starts[v + 1] are of reference v
     keypoints: Floats  # (T, 2)
-    stored: Bytes | Floats  # (T, D) the codes, where the extractor gives such, else the descriptors
+    descriptors: Floats  # (T, D) unit norm
+    codes: Bytes | None  # (T, D) the 8-bit vectors that the descriptors came from, where there are any
     points: Indices  # (T,) the row of `xyz` that a keypoint is an image of, or -1
     xyz: NDArray[np.float64]  # (P, 3) in the scene's unit of length
 
     def __len__(self) -> int:
         return len(self.names)
 
-    @cached_property
-    def descriptors(self) -> Floats:
-        """(T, D) unit norm."""
-        return self.stored if self.codes is None else unit_rows(self.stored)
-
-    @property
-    def codes(self) -> Bytes | None:
-        """(T, D) 8-bit vectors, where the extractor gives such."""
-        return self.stored if self.stored.dtype == np.uint8 else None
-
     def rows(self, reference: int) -> slice:
         """The keypoints of one reference."""
         return slice(int(self.starts[reference]), int(self.starts[reference + 1]))
 
     def to_arrays(self) -> tuple[Arrays, dict[str, Any]]:
-        """What a file of tensors holds of it, and its metadata."""
-        arrays = {
-            "starts": self.starts,
-            "keypoints": self.keypoints,
-            "stored": self.stored,
-            "points": self.points,
-            "xyz": self.xyz,
-        }
-        return arrays, {"names": list(self.names)}
+        """What a file of tensors holds of it, and its metadata. Descriptors that came from codes are not stored."""
+        arrays: Arrays = {"starts": self.starts, "keypoints": self.keypoints, "points": self.points, "xyz": self.xyz}
+        stored: Arrays = {"descriptors": self.descriptors} if self.codes is None else {"codes": self.codes}
+        return arrays | stored, {"names": list(self.names)}
 
 
-def from_arrays(arrays: Arrays, meta: dict[str, Any]) -> Map:
-    """The map that `to_arrays` took apart.
-
-    Raises
-    ------
-    UserError
-        if an array is missing.
-    """
-    try:
-        return Map(names=tuple(meta["names"]), **arrays)
-    except (KeyError, TypeError) as error:
-        raise UserError(f"not a whole map: {error}") from error
+def from_arrays(arrays: Arrays, meta: Mapping[str, Any]) -> Map:
+    """The map that `to_arrays` took apart."""
+    codes = arrays.get("codes")
+    return Map(
+        names=tuple(meta["names"]),
+        starts=arrays["starts"],
+        keypoints=arrays["keypoints"],
+        descriptors=arrays["descriptors"] if codes is None else unit_rows(codes),
+        codes=codes,
+        points=arrays["points"],
+        xyz=arrays["xyz"],
+    )

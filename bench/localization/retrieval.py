@@ -13,7 +13,6 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from bench.localization.maps import Map
 from bench.types import Indices
 
 TOP = 20  # references of a query (the paper's Sec. 6.2)
@@ -56,10 +55,10 @@ class Bags:
         -------
         (min(count, V),) int64
         """
-        bag = np.bincount(words.ravel(), minlength=self.size) * self.weights  # (K,) 
+        bag = np.bincount(words.ravel(), minlength=self.size) * self.weights  # (K,)
         return np.argsort(-(self._rows @ bag), kind="stable")[:count]
 
 
 def _unit(rows: scipy.sparse.csr_matrix) -> scipy.sparse.csr_matrix:
-    norms = np.sqrt(rows.multiply(rows).sum(axis=1)).A1 if False else np.sqrt(np.asarray(rows.multiply(rows).sum(axis=1)).ravel())
+    norms = np.sqrt(np.asarray(rows.multiply(rows).sum(axis=1)).ravel())
     return scipy.sparse.diags(1 / np.where(norms > 0, norms, 1)) @ rows
