@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from bench.datasets import photographs
 from bench.datasets.photographs import SIDE
 from bench.features import dictionary
 from bench.kernels.search import unit_rows
@@ -131,8 +132,9 @@ def check_metric(metric: Metric, seed: int = 0) -> None:
     """A metric keeps its range, changes nothing, and prefers the truth to an estimate."""
     rng = np.random.default_rng(seed)
     if metric.compares == "images":
-        truth = rng.random((48, 40, 3), dtype=np.float32)
-        estimate = np.clip(truth + rng.normal(0, 0.1, truth.shape), 0, 1).astype(np.float32)
+        # Somebody's portrait, and noise that little is left of it under: a metric may have nothing to say of other pictures.
+        truth = (photographs.read(photographs.of_people()[0].path).pixels / 255).astype(np.float32)
+        estimate = np.clip(truth + rng.normal(0, 0.5, truth.shape), 0, 1).astype(np.float32)
     else:
         truth, estimate = example_features(30, seed).descriptors, example_features(30, seed + 1).descriptors
     before = truth.copy(), estimate.copy()
