@@ -27,7 +27,7 @@ from bench.errors import PluginError, UnitError, UserError, blamed
 from bench.features import kept
 from bench.features.sift import Sift
 from bench.place import Place
-from bench.plugin import Attack, Dataset, Defense, Extractor, Metric, Outcome, Privacy, Shot, Task, Trial
+from bench.plugin import Attack, Dataset, Defense, Extractor, Metric, Outcome, Plugin, Privacy, Shot, Task, Trial
 from bench.population import Population
 from bench.public import Public
 from bench.records import EVERY_UNIT, Record
@@ -206,8 +206,10 @@ def planned(asked: Asked) -> Plan:
             "defense": protected,
             "attack": _attack_configuration(task, defense, attack, extractor, public, reason),
             "dataset": judged,
+            "task_settings": _settings(task),
             "metric_settings": settings,
             "seed": seed,
+            "sources": {"defense": environment.file_digest(defense), "attack": attack and environment.file_digest(attack)},
         }
         cell_id = records.cell_id(spec.written(task), head["defense"], head["attack"], judged, seed, settings)
         head |= {"cell_id": cell_id, "run_hash": records.run_hash(cell_id, ran), "environment": ran}
@@ -258,10 +260,10 @@ def randomness(*parts: Any) -> np.random.Generator:
     return np.random.default_rng(int(hashlib.sha256(records.canonical(parts).encode()).hexdigest(), 16))
 
 
-def _settings(metric: Metric) -> dict[str, Any]:
-    fields = spec.written(metric)
+def _settings(plugin: Plugin) -> dict[str, Any]:
+    fields = spec.written(plugin)
     del fields["name"]
-    return fields | dict(metric.parameters)
+    return fields | (dict(plugin.parameters) if isinstance(plugin, Metric) else {})
 
 
 def _attack_configuration(
