@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import itertools
 import math
 import re
 from collections.abc import Iterable, Iterator, Sequence
@@ -12,12 +14,14 @@ import numpy as np
 
 from bench import registry
 from bench.listing import described
-from leaderboard.reproduce.intervals import Interval, interval, share
+from leaderboard.reproduce.intervals import Interval, interval, proportion
 from leaderboard.tables import PAPER
 
 PRIVACY = "ssim"  # what attacks are compared by: how much of the photograph comes back
 # What a server can do, the first of these that was measured: its recall of localization, or else how well it matches.
 UTILITY = ("recall_0.25m_2deg", "accuracy_3px")
+
+PARTS = ("foreground", "background")  # of an image, over which some metrics are told as well
 
 
 @dataclass(frozen=True)
@@ -35,6 +39,9 @@ class Measure:
 def measures(names: Iterable[str]) -> list[Measure]:
     """What is known of these metrics; of one that is not installed here, nothing but its name."""
     known = {measure.name: measure for measure in (*_OF_TASKS, *_of_plugins())}
+    for measure, part in itertools.product(list(known.values()), PARTS):
+        name = f"{measure.name}_{part}"
+        known[name] = dataclasses.replace(measure, name=name, label=f"{measure.label}, {part}", explanation="")
     return [known.get(name) or _family(name) for name in names]
 
 
@@ -49,7 +56,9 @@ def summary(of: Measure, values: Sequence[float | None]) -> Interval | None:
     if of.kind == "median":
         middle = float(np.median([math.inf if value is None else value for value in values]))
         return Interval(middle, -math.inf, math.inf, len(values))
-    return share(known) if of.kind == "share" else interval(known)
+    if of.kind == "share" and set(known) <= {0.0, 1.0}:
+        return proportion(known)
+    return interval(known)  # of a share, too, once each unit has its mean over several seeds
 
 
 _OF_TASKS = (

@@ -6,7 +6,7 @@ import csv
 import io
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from statistics import median
@@ -116,9 +116,9 @@ def to_markdown(sheet: Sheet) -> str:
     lines = [f"**{markdown(sheet.heading)}**", "", markdown_row(column.label for column in sheet.columns)]
     lines.append(markdown_row("---" if column.text else "---:" for column in sheet.columns))
     for row in sheet.rows:
-        texts = ((column, markdown(text)) for column, text in _texts(sheet, row, notes))
+        texts = _texts(sheet, row, notes, markdown)
         lines.append(markdown_row(f"**{text}**" if sheet.is_best(column, row) else text for column, text in texts))
-    lines += ["", *(f"{markdown(f'[{place}] {note}')}  " for note, place in notes.items()), ""]
+    lines += ["", *(f"[{place}] {markdown(note)}  " for note, place in notes.items()), ""]
     lines += [f"- {markdown(line)}" for line in sheet.remarks]
     return "\n".join(lines) + "\n"
 
@@ -150,7 +150,7 @@ def to_latex(sheet: Sheet) -> str:
         r"\midrule",
     ]
     for row in sheet.rows:
-        texts = ((column, latex(text)) for column, text in _texts(sheet, row, notes))
+        texts = ((column, latex(text)) for column, text in _texts(sheet, row, notes, str))
         cells = [rf"\textbf{{{text}}}" if sheet.is_best(column, row) else text for column, text in texts]
         lines.append(" & ".join(cells) + r" \\")
     lines += [r"\bottomrule", r"\end{tabular}}", "", r"\smallskip\footnotesize"]
@@ -165,7 +165,8 @@ def markdown(text: str) -> str:
 
 def latex(text: str) -> str:
     """Text that LaTeX prints as it is, whatever it is."""
-    return "".join(_LATEX.get(letter, letter) for letter in _one_line(text))
+    plain = "".join(_LATEX.get(letter, letter) for letter in _one_line(text))
+    return re.sub("-(?=-)", "-{}", plain)  # two of them are no dash
 
 
 def guarantee(record: Record) -> str:
@@ -267,10 +268,11 @@ def _numbered(sheet: Sheet) -> dict[str, int]:
     return {note: place for place, note in enumerate(dict.fromkeys(row.note for row in sheet.rows if row.note), start=1)}
 
 
-def _texts(sheet: Sheet, row: Row, notes: dict[str, int]) -> Iterable[tuple[Column, str]]:
-    """The row as text, with the number of its note behind the defense's name."""
+def _texts(sheet: Sheet, row: Row, notes: dict[str, int], escape: Callable[[str], str]) -> Iterator[tuple[Column, str]]:
+    """The row as text, with the number of its note behind the defense's name. What is no number is escaped."""
     for column in sheet.columns:
-        text = shown(column, row.values[column.name])
+        value = row.values[column.name]
+        text = escape(value) if isinstance(value, str) else shown(column, value)
         yield column, f"{text} [{notes[row.note]}]" if column.name == "defense" and row.note else text
 
 
@@ -307,7 +309,6 @@ _LATEX = {letter: f"\\{letter}" for letter in "{}$&#_%"} | {
     "∞": r"$\infty$",
     "°": r"$^\circ$",
     "−": "$-$",
-    "-": "{-}",  # two of them are not a dash
     "`": r"\textasciigrave{}",
     "[": "{[}",  # so that a row which begins with it is not read as an argument of the line before
     "]": "{]}",
