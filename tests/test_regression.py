@@ -2,6 +2,7 @@
 
 import copy
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ import bench
 from bench import cli
 from bench.kernels.search import unit_rows
 from bench.plugin import View
+from bench.tasks.reconstruction import Reconstruction
 from bench.testing import small_dictionary
 from bench.types import Features, WordSets
 from defenses.ldp import LDP
@@ -22,23 +24,29 @@ from leaderboard import findings, speed
 from leaderboard.regression import Finding, compare, tolerance
 
 Records = list[dict[str, Any]]
+SEEDS = range(2)
+PAINTED = Reconstruction(inverter="painter")
 
 
-@pytest.fixture
-def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    install(tmp_path / "installed", monkeypatch, FAKES)
-    monkeypatch.chdir(tmp_path)
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """With photographs in it, and the fake plugins installed for as long as it is used."""
+    made = tmp_path_factory.mktemp("regression")
+    album(made / "album", 3)
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        install(made / "installed", monkeypatch, FAKES)
+        yield made
 
 
-@pytest.fixture
-def images(tmp_path: Path) -> Path:
-    return album(tmp_path / "album", 4)
+@pytest.fixture(scope="module")
+def before(folder: Path) -> Records:
+    return measured(folder, SEEDS)
 
 
-def measured(tmp_path: Path, images: Path, seeds: range, epsilon: float = 8.0) -> Records:
+def measured(folder: Path, seeds: range, epsilon: float = 8.0) -> Records:
     """The first word of each set as a guess, at an ε where about every second set holds the true one."""
-    defense = LDP(epsilon=epsilon, dictionary=small_dictionary(tmp_path))
-    return [record for seed in seeds for record in bench.run([defense], [Guess()], images, seed=seed)]
+    defense = LDP(epsilon=epsilon, dictionary=small_dictionary(folder))
+    return [record for seed in seeds for record in bench.run([defense], [Guess()], folder / "album", task=PAINTED, seed=seed)]
 
 
 def verdicts(found: list[Finding]) -> dict[str, str]:
@@ -48,36 +56,33 @@ def verdicts(found: list[Finding]) -> dict[str, str]:
 # ---- what must pass, and what must fail
 
 
-def test_the_same_again_is_the_same(installed: None, images: Path, tmp_path: Path) -> None:
-    records = measured(tmp_path, images, range(3))
-    found = compare(records, copy.deepcopy(records))
+def test_the_same_again_is_the_same(folder: Path, before: Records) -> None:
+    found = compare(before, copy.deepcopy(before))
     assert {finding.verdict for finding in found} == {"same"}
     assert {"angle", "l2", "recovered"} <= set(verdicts(found))
 
 
-def test_other_seeds_are_within_the_tolerance(installed: None, images: Path, tmp_path: Path) -> None:
+def test_other_seeds_are_within_the_tolerance(folder: Path, before: Records) -> None:
     """And differ, so that something was tolerated."""
-    found = compare(measured(tmp_path, images, range(3)), measured(tmp_path, images, range(3, 6)))
+    found = compare(before, measured(folder, range(2, 4)))
     assert {finding.verdict for finding in found} == {"same"}
     assert any(finding.before != finding.after for finding in found)
 
 
-def test_a_weakened_attack_fails(installed: None, images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    before = measured(tmp_path, images, range(3))
+def test_a_weakened_attack_fails(folder: Path, before: Records, monkeypatch: pytest.MonkeyPatch) -> None:
 
     def blunt(self: Guess, view: View, rng: np.random.Generator) -> np.ndarray:
         assert isinstance(view.release, WordSets)
-        return unit_rows(rng.random(view.release.candidates[:, 0].shape, dtype=np.float32))
+        return unit_rows(rng.normal(size=view.release.candidates[:, 0].shape).astype(np.float32))
 
     monkeypatch.setattr(Guess, "recover", blunt)
-    found = verdicts(compare(before, measured(tmp_path, images, range(3))))
+    found = verdicts(compare(before, measured(folder, SEEDS)))
     assert found["recovered"] == found["angle"] == "weaker"
     assert "better" not in found.values()
 
 
-def test_a_broken_defense_fails(installed: None, images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_broken_defense_fails(folder: Path, before: Records, monkeypatch: pytest.MonkeyPatch) -> None:
     """One that always tells the true word first."""
-    before = measured(tmp_path, images, range(3))
     protect = LDP.protect
 
     def telling(self: LDP, secret: Features, public: Any, rng: np.random.Generator) -> WordSets:
@@ -86,31 +91,27 @@ def test_a_broken_defense_fails(installed: None, images: Path, tmp_path: Path, m
         return release
 
     monkeypatch.setattr(LDP, "protect", telling)
-    found = verdicts(compare(before, measured(tmp_path, images, range(3))))
+    found = verdicts(compare(before, measured(folder, SEEDS)))
     assert found["recovered"] == found["angle"] == "worse"
 
 
-def test_a_defense_whose_source_is_another_may_get_better(
-    installed: None, images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    before = measured(tmp_path, images, range(3))
+def test_a_defense_whose_source_is_another_may_get_better(folder: Path, before: Records, monkeypatch: pytest.MonkeyPatch) -> None:
     protect = LDP.protect
 
     def silent(self: LDP, secret: Features, public: Any, rng: np.random.Generator) -> WordSets:
         release = protect(self, secret, public, rng)
-        release.candidates[:] = unit_rows(rng.random(release.candidates.shape[2], dtype=np.float32)[None])
+        release.candidates[:] = unit_rows(rng.normal(size=release.candidates[:, 0].shape).astype(np.float32))[:, None]
         return release
 
     monkeypatch.setattr(LDP, "protect", silent)
-    after = measured(tmp_path, images, range(3))
-    assert set(verdicts(compare(before, after)).values()) == {"weaker"}
+    after = measured(folder, SEEDS)
+    assert verdicts(compare(before, after))["recovered"] == "weaker"
     for record in after:
         record["sources"]["defense"] = "sha256:another"
     assert verdicts(compare(before, after))["recovered"] == "better"
 
 
-def test_a_weaker_promise_is_worse_without_tolerance(installed: None, images: Path, tmp_path: Path) -> None:
-    before = measured(tmp_path, images, range(1))
+def test_a_weaker_promise_is_worse_without_tolerance(folder: Path, before: Records) -> None:
     after = copy.deepcopy(before)
     for record in after:
         record["privacy"] |= {"epsilon_descriptor": 8.5}
@@ -121,15 +122,14 @@ def test_a_weaker_promise_is_worse_without_tolerance(installed: None, images: Pa
     assert verdicts(compare(before, after))["epsilon_descriptor"] == "worse"
 
 
-def test_lost_units_failures_and_cells(installed: None, images: Path, tmp_path: Path) -> None:
-    records = measured(tmp_path, images, range(1))
+def test_lost_units_failures_and_cells(folder: Path, before: Records) -> None:
     broken = [
-        record | {"status": "failed", "reason": "out of paper"} if record["unit"] == "1.png" else record for record in records
+        record | {"status": "failed", "reason": "out of paper"} if record["unit"] == "1.png" else record for record in before
     ]
-    (lost,) = [finding for finding in compare(records, broken) if finding.verdict == "missing"]
-    assert lost.told == "1 of 4 units: 1.png: out of paper"
-    other = measured(tmp_path, images, range(1), epsilon=9.0)
-    assert [finding.verdict for finding in compare(records, other)] == ["missing", "new"]
+    (lost,) = [finding for finding in compare(before, broken) if finding.verdict == "missing"]
+    assert lost.told == "1 of 3 units: 1.png: out of paper"
+    other = measured(folder, range(1), epsilon=9.0)
+    assert [finding.verdict for finding in compare(before, other)] == ["missing", "new"]
 
 
 def test_utility_has_its_own_direction() -> None:
@@ -183,10 +183,9 @@ def test_one_seed_takes_the_spread_over_units_and_one_unit_the_floor() -> None:
 
 
 @pytest.fixture
-def folders(installed: None, images: Path, tmp_path: Path) -> tuple[Path, Path]:
-    records = measured(tmp_path, images, range(2))
-    worse = [record | {"metrics": record["metrics"] | {"recovered": 1.0}} for record in records]
-    for name, held in (("before", records), ("after", worse)):
+def folders(before: Records, tmp_path: Path) -> tuple[Path, Path]:
+    worse = [record | {"metrics": record["metrics"] | {"recovered": 1.0}} for record in before]
+    for name, held in (("before", before), ("after", worse)):
         (tmp_path / name).mkdir()
         (tmp_path / name / "records.jsonl").write_text("".join(json.dumps(record) + "\n" for record in held))
     return tmp_path / "before" / "records.jsonl", tmp_path / "after"
@@ -211,7 +210,7 @@ def test_annotations_are_escaped(folders: tuple[Path, Path], capfd: pytest.Captu
     baseline, results = map(str, folders)
     assert cli.main(["check", "--baseline", baseline, "--results", results, "--format", "github"]) == 3
     (line, _) = capfd.readouterr().out.splitlines()
-    assert line.startswith("::error title=worse%3A ldp%3Aepsilon=8%2Csubset_size=2 against guess::recovered was 0.")
+    assert line.startswith("::error title=worse%3A ldp%3Aepsilon=8%2Csubset_size=2%2Cwords=0 against guess::recovered was 0.")
     nasty = Finding(verdict="missing", defense="a::b,100%\r\n::error::", attack="c", told="50%\r\n::stop-commands::x")
     written = findings.to_github(nasty)
     assert written == (

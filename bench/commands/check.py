@@ -8,8 +8,8 @@ from pathlib import Path
 from bench.terminal import DONE, FAILED, REGRESSION, print_rich
 
 SUMMARY = "compare results with a baseline, cell by cell, and tell what got better and what got worse"
-EPILOG = """Cells are matched by configuration and inputs, whatever the seed. The tolerance comes from the spread from seed to seed,
-or from the bootstrap over units where there is one seed; docs/formats.md states the rule.
+EPILOG = """Cells are matched by configuration and inputs, whatever the seed. The tolerance comes from the spread from seed to
+seed, or from the bootstrap over units where there is one seed; docs/formats.md states the rule.
 
 exit status: 0 nothing got worse, 1 something of the baseline is missing, 2 a mistake in what was asked,
 3 privacy or utility got worse than tolerated, or an attack weaker
