@@ -28,7 +28,7 @@ from leaderboard.tables import labels
 
 Verdict = Literal["worse", "weaker", "missing", "better", "new", "same"]  # the gravest first
 CONFIDENCE = 0.999
-# Bf16 against float32 moves the shipped networks' SSIM by up to 0.2% and their MAE by up to 0.6%.
+# Eight times what bf16 in the place of float32 made of the shipped networks: 0.12% at most, of means over seven photographs.
 RELATIVE_FLOOR = 0.01  # of the baseline's mean
 ABSOLUTE_FLOOR = 0.001  # in the metric's unit
 PROMISE = "epsilon_descriptor"
