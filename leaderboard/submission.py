@@ -11,7 +11,6 @@ import json
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -75,7 +74,7 @@ def check(
         raise UserError(f"{path}: no such file")
     texts = path.read_bytes().split(b"\n")
     texts = texts[:-1] if not texts[-1] else texts
-    here = _Here(None if images is None else images, files)
+    here = _Here(images, files)
     read = list(_read(texts))
     lines = [one for one in read if isinstance(one, Line)]
     found = [one for one in read if isinstance(one, Fault)]
@@ -161,13 +160,8 @@ class _Here:
 
     def __init__(self, images: Path | None, files: Sequence[Path]) -> None:
         self.images = None if images is None else folder(images)
-        self._files = files
-
-    @cached_property
-    def assets(self) -> dict[str, Asset]:
-        """What fields call the content of a digest."""
         shipped = {_digest(ASSETS / file): Asset(name) for name, file in SHIPPED.items() if (ASSETS / file).is_file()}
-        return shipped | {_digest(file): Asset(file) for file in self._files}
+        self.assets = shipped | {_digest(file): Asset(file) for file in files}  # what fields call the content of a digest
 
     def photographs(self, record: Record) -> Images:
         """The photographs of a record.
