@@ -14,7 +14,7 @@ of the paired differences, at the same level. The floor is what a number may mov
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -101,9 +101,9 @@ def _cells(records: Iterable[Record]) -> dict[str, list[Record]]:
 
 
 def _configuration(record: Record) -> str:
-    """What `cell_id` hashes, without the seed."""
+    """What `cell_id` hashes, without the seed; and without the metrics' settings, so that one more metric makes no other cell."""
     dataset = {name: value for name, value in record["dataset"].items() if name not in ("name", "spec")}
-    parts = ("schema", "task", "task_settings", "defense", "attack", "metric_settings")
+    parts = ("schema", "task", "task_settings", "defense", "attack")
     return canonical([dataset, *(record.get(part) for part in parts)])
 
 
@@ -120,9 +120,12 @@ def _cell(before: list[Record], after: list[Record], where: Mapping[str, str]) -
     attacked = before[0]["attack"] is not None
     changed = [part for part in ("defense", "attack") if _source(before, part) != _source(after, part)]
     for metric in measures(sorted({name for unit in shared for record in had[unit] for name in record["metrics"]})):
-        old, new = (_values(side, shared, lambda record: record["metrics"].get(metric.name)) for side in (had, have))  # noqa: B023
+        old, new = (_values(side, shared, metric.name) for side in (had, have))
         units = [unit for unit in old if unit in new]
         if metric.better == 0 or not units:
+            continue
+        if _settings(before, metric.name) != _settings(after, metric.name):
+            yield Finding(verdict="missing", **where, metric=metric.name, told="it is measured with other settings")
             continue
         old, new = ({unit: side[unit] for unit in units} for side in (old, new))
         first, second = _mean(old), _mean(new)
@@ -154,11 +157,9 @@ def _done(records: Iterable[Record]) -> dict[str, list[Record]]:
     return done
 
 
-def _values(
-    side: Mapping[str, list[Record]], units: Iterable[str], of: Callable[[Record], float | None]
-) -> dict[str, list[float]]:
+def _values(side: Mapping[str, list[Record]], units: Iterable[str], metric: str) -> dict[str, list[float]]:
     """The known values of each unit that has any."""
-    found = {unit: [value for record in side[unit] if (value := of(record)) is not None] for unit in units}
+    found = {unit: [value for record in side[unit] if (value := record["metrics"].get(metric)) is not None] for unit in units}
     return {unit: values for unit, values in found.items() if values}
 
 
@@ -168,6 +169,10 @@ def _mean(side: Samples) -> float:
 
 def _source(records: Sequence[Record], part: str) -> Any:
     return (records[-1].get("sources") or {}).get(part)
+
+
+def _settings(records: Sequence[Record], metric: str) -> Any:
+    return (records[-1].get("metric_settings") or {}).get(metric)
 
 
 def _verdict(gain: float, allowed: float, attacked: bool, changed: Sequence[str]) -> Verdict:

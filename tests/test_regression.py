@@ -132,6 +132,15 @@ def test_lost_units_failures_and_cells(folder: Path, before: Records) -> None:
     assert [finding.verdict for finding in compare(before, other)] == ["missing", "new"]
 
 
+def test_another_metric_makes_no_other_cell_and_other_settings_cannot_be_compared(before: Records) -> None:
+    after = copy.deepcopy(before)
+    for record in after:
+        record["metric_settings"] |= {"more": {}, "ssim": {"sigma": 2.0}}
+    found = verdicts(compare(before, after))
+    assert found["ssim"] == "missing"
+    assert found["recovered"] == "same"
+
+
 def test_utility_has_its_own_direction() -> None:
     """Recall of localization, which no attack takes part in."""
 
