@@ -402,11 +402,23 @@ def _protect(plan: Plan, cell: Cell, features: Features, content: str, *repetiti
     return release
 
 
-def _judged(plan: Plan, cell: Cell, unit: Unit, shots: tuple[Shot, ...], notes: Sequence[str], out: Path | None) -> Record:
+def trial(plan: Plan, cell: Cell, unit: Unit) -> Trial:
+    """A unit of a cell, extracted and protected as `execute` does it, before it is judged.
+
+    Raises
+    ------
+    UnitError
+        if it cannot be read, has no keypoint, or a plugin breaks.
+    """
+    shots = tuple(_shot(plan, cell, unit, number, _observed(plan, image)) for number, image in enumerate(unit.images))
+    return _trial(plan, cell, unit, shots)
+
+
+def _trial(plan: Plan, cell: Cell, unit: Unit, shots: tuple[Shot, ...]) -> Trial:
     head = cell.head
     content = plan.hashes[unit.name]
     first = shots[0].secret
-    trial = Trial(
+    return Trial(
         unit=unit,
         shots=shots,
         defense=cell.defense,
@@ -419,9 +431,13 @@ def _judged(plan: Plan, cell: Cell, unit: Unit, shots: tuple[Shot, ...], notes: 
         repeats=tuple(_protect(plan, cell, first, content, number) for number in _repetitions(cell.attack)),
         carry_out=plan.carry_out,
     )
+
+
+def _judged(plan: Plan, cell: Cell, unit: Unit, shots: tuple[Shot, ...], notes: Sequence[str], out: Path | None) -> Record:
+    tried = _trial(plan, cell, unit, shots)
     started = time.perf_counter()
     with blamed(f"task {plan.task.name()}"):
-        outcome = plan.task.judge(trial)
+        outcome = plan.task.judge(tried)
     keypoints = max(len(shot.secret) for shot in shots)
     record = _record(cell, unit, status="ok", outcome=outcome, keypoints=keypoints, notes=notes)
     record["seconds"] = time.perf_counter() - started
