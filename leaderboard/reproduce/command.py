@@ -90,16 +90,14 @@ def _named(images: Path | None, judged: Judged) -> str:
 def _figures(setting: Setting, judged: Judged, out: Path) -> Done:
     """Run the rows of all figures, and draw them into `out`/reproduced."""
     drawings = figures.everything()
-    left_out = {drawing.name: reason for drawing in drawings if (reason := drawing.left_out())}
-    rows = {row.name: row for drawing in drawings if drawing.name not in left_out for row in drawing.rows(setting)}
+    rows = {row.name: row for drawing in drawings for row in drawing.rows(setting)}
     ran = run.execute(list(rows.values()), setting, judged, out, FIGURES)
     scene = Scene(setting=setting, judged=judged, ran=ran, out=out)
-    shown = [Text(f"left out: {name}: {reason}") for name, reason in left_out.items()]
+    shown = []
     for drawing in drawings:
-        if drawing.name not in left_out:
-            for kind, figure in drawing.draw(scene):
-                files = save(figure, out / FIGURES / f"{drawing.name}-{kind}".removesuffix("-"))
-                shown += [Text(str(file)) for file in files]
+        for kind, figure in drawing.draw(scene):
+            files = save(figure, out / FIGURES / f"{drawing.name}-{kind}".removesuffix("-"))
+            shown += [Text(str(file)) for file in files]
     return Done(out=out, shown=tuple(shown), failed=run.failures(ran))
 
 
