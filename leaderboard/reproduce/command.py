@@ -102,16 +102,14 @@ def _named(images: Path | None, judged: Judged) -> str:
 
 def _figures(name: str, drawings: tuple[Drawing, ...], setting: Setting, judged: Judged, out: Path, workers: int) -> Done:
     """Run the rows of these figures, and draw them into `out`/figures."""
-    left_out = {drawing.name: reason for drawing in drawings if (reason := drawing.left_out())}
-    rows = {row.name: row for drawing in drawings if drawing.name not in left_out for row in drawing.rows(setting)}
+    rows = {row.name: row for drawing in drawings for row in drawing.rows(setting)}
     ran = run.execute(list(rows.values()), setting, judged, out, name, workers)
     scene = Scene(setting=setting, judged=judged, ran=ran, out=out)
-    shown = [Text(f"left out: {drawing}: {reason}") for drawing, reason in left_out.items()]
+    shown = []
     for drawing in drawings:
-        if drawing.name not in left_out:
-            for kind, figure in drawing.draw(scene):
-                files = save(figure, out / FIGURES / f"{drawing.name}-{kind}".removesuffix("-").replace("/", "-"))
-                shown += [Text(str(file)) for file in files]
+        for kind, figure in drawing.draw(scene):
+            files = save(figure, out / FIGURES / f"{drawing.name}-{kind}".removesuffix("-").replace("/", "-"))
+            shown += [Text(str(file)) for file in files]
     return Done(out=out, shown=tuple(shown), failed=run.failures(ran))
 
 

@@ -64,7 +64,6 @@ class Drawing:
     name: str
     draw: Callable[[Scene], Iterator[tuple[str, Figure]]]  # yields what is added to the name, and the figure
     rows: Callable[[Setting], tuple[Row, ...]] = field(default=lambda setting: ())
-    left_out: Callable[[], str | None] = field(default=lambda: None)  # why it cannot be drawn here, if it cannot
     place: bool = False  # whether it is about the queries of a place; such a figure is a command of its own
 
 
