@@ -27,7 +27,7 @@ from bench.errors import PluginError, UnitError, UserError, blamed
 from bench.features import kept
 from bench.features.sift import Sift
 from bench.place import Place
-from bench.plugin import Attack, Dataset, Defense, Extractor, Metric, Outcome, Privacy, Shot, Task, Trial
+from bench.plugin import Attack, Dataset, Defense, Extractor, Metric, Outcome, Plugin, Privacy, Shot, Task, Trial
 from bench.population import Population
 from bench.public import Public
 from bench.records import EVERY_UNIT, Record
@@ -219,6 +219,7 @@ def planned(asked: Asked) -> Plan:
             "defense": protected,
             "attack": _attack_configuration(task, defense, attack, extractor, public, reason),
             "dataset": judged,
+            "task_settings": _settings(task),
             "metric_settings": settings,
             "seed": seed,
         }
@@ -278,10 +279,10 @@ def _metrics() -> Iterator[Metric]:
             yield metric()
 
 
-def _settings(metric: Metric) -> dict[str, Any]:
-    settings = spec.written(metric)
+def _settings(plugin: Plugin) -> dict[str, Any]:
+    settings = spec.written(plugin)
     del settings["name"]
-    return settings | dict(metric.parameters)
+    return settings | (dict(plugin.parameters) if isinstance(plugin, Metric) else {})
 
 
 def _attack_configuration(

@@ -12,13 +12,12 @@ from bench import fields, registry
 from bench.errors import UserError
 from bench.plugin import Plugin
 from bench.public import ASSETS, SHIPPED
-from bench.records import Record
 from bench.registry import Kind
 from leaderboard.boards import Cell
 
 BUILTIN = "builtin"  # the photographs that need no --images
 Lookup = Callable[[Kind, str], type[Plugin] | None]
-HERE = "reconstruction", "dia"  # the default task, and what paints the descriptors there
+DEFAULT = {"--task": "reconstruction", "--extractor": "sift"}  # of the command line
 
 
 @dataclass(frozen=True)
@@ -45,7 +44,8 @@ def recipe(cell: Cell, lookup: Lookup = installed) -> Recipe:
     """
     head, spec = cell.head, functools.partial(_spec, lookup)
     needs: dict[str, None] = {}
-    options = [("--task", _task(head)), ("--defense", spec(registry.DEFENSE, head["defense"], needs))]
+    task = {"name": head["task"], **(head.get("task_settings") or {})}
+    options = [("--task", spec(registry.TASK, task, needs)), ("--defense", spec(registry.DEFENSE, head["defense"], needs))]
     if head["attack"] is not None:
         options.append(("--attack", spec(registry.ATTACK, head["attack"], needs)))
     options.append(("--extractor", spec(registry.EXTRACTOR, head["dataset"]["extractor"], needs)))
@@ -56,20 +56,13 @@ def recipe(cell: Cell, lookup: Lookup = installed) -> Recipe:
         needs[f"{head['dataset']['name']}: a folder of the photographs with the content {head['dataset']['hash']}"] = None
     options += [("--metric", text) for text in _metrics(lookup, head["metric_settings"], needs)]
     seeds = sorted({one.record["seed"] for one in cell.found})
-    default = {"--task": HERE[0], "--extractor": "sift"}
-    words = ["bench run", *(_option(option, text) for option, text in options if default.get(option) != text)]
+    words = ["bench run", *(_option(option, text) for option, text in options if DEFAULT.get(option) != text)]
     return Recipe("\n".join(" ".join([*words, f"--seed {seed}"]) for seed in seeds), tuple(needs))
 
 
 def _option(name: str, text: str) -> str:
     """An option for a shell, whatever its value is."""
     return f"{name}{'=' if text.startswith('-') else ' '}{shlex.quote(text)}"
-
-
-def _task(head: Record) -> str:
-    inversion = (head["attack"] or {}).get("inversion")
-    painter = inversion["name"] if inversion else HERE[1]
-    return str(head["task"]) if painter == HERE[1] else f"{head['task']}:inverter={painter}"
 
 
 def _metrics(lookup: Lookup, settings: Mapping[str, Mapping[str, Any]], needs: dict[str, None]) -> Iterator[str]:

@@ -123,6 +123,16 @@ def test_a_shell_takes_names_for_names(name: str) -> None:
     assert args.out is None
 
 
+def test_the_settings_of_a_task_are_told() -> None:
+    settings = {
+        "task": "localization",
+        "task_settings": {"retrieval": "released", "retrieved": 20, "trials": 500},
+        "attack": None,
+    }
+    command = recipe(of(reconstructions({"name": "none"}, [0.5], **settings))).command
+    assert command.startswith("bench run --task localization:retrieval=released,trials=500 --defense none --images photos")
+
+
 def test_the_place_of_a_dataset_is_told_by_its_spec() -> None:
     gallery = fabricated.GALLERY | {"spec": {"name": "gallery", "views": 12, "queries": 300}}
     cell = of(reconstructions({"name": "none"}, [0.5], dataset=gallery))
