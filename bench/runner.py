@@ -27,7 +27,21 @@ from bench.errors import PluginError, UnitError, UserError, blamed
 from bench.features import kept
 from bench.features.sift import Sift
 from bench.place import Place
-from bench.plugin import Attack, Dataset, Defense, Extractor, Metric, Outcome, Plugin, Privacy, Shot, Task, Trial
+from bench.plugin import (
+    Attack,
+    CarryOut,
+    Dataset,
+    Defense,
+    Extractor,
+    Metric,
+    Outcome,
+    Plugin,
+    Privacy,
+    Shot,
+    Task,
+    Trial,
+    at_once,
+)
 from bench.population import Population
 from bench.public import Public
 from bench.records import EVERY_UNIT, Record
@@ -76,6 +90,7 @@ class Plan:
     metrics: tuple[Metric, ...]
     public: Public
     seed: int
+    carry_out: CarryOut = at_once  # where attacks are carried out
 
     @property
     def hash(self) -> str:
@@ -178,6 +193,8 @@ def prepare_pairs(
         metrics=tuple(metrics),
     )
     plan = planned(asked)
+    if all(cell.reason for cell in plan.cells):
+        raise UserError("nothing to run: " + "; ".join(sorted({str(cell.reason) for cell in plan.cells})))
     _rehearse(plan)
     return plan
 
@@ -188,7 +205,7 @@ def planned(asked: Asked) -> Plan:
     Raises
     ------
     UserError
-        if something is wrong with what was asked, or no pair of it applies.
+        if something is wrong with what was asked.
     """
     task, extractor, dataset, seed = asked.task, asked.extractor, asked.dataset, asked.seed
     collection = task.collection(asked.images, dataset)
@@ -222,12 +239,11 @@ def planned(asked: Asked) -> Plan:
             "task_settings": _settings(task),
             "metric_settings": settings,
             "seed": seed,
+            "sources": {"defense": environment.file_digest(defense), "attack": attack and environment.file_digest(attack)},
         }
         cell_id = records.cell_id(spec.written(task), head["defense"], head["attack"], judged, seed, settings)
         head |= {"cell_id": cell_id, "run_hash": records.run_hash(cell_id, ran), "environment": ran}
         cells.append(Cell(defense, attack, defense.privacy(public), populations[defense], head, reason))
-    if all(cell.reason for cell in cells):
-        raise UserError("nothing to run: " + "; ".join(sorted({str(cell.reason) for cell in cells})))
     unique = {cell.head["cell_id"]: cell for cell in cells}  # one that was asked for twice is done once
     return Plan(asked, task, tuple(unique.values()), collection.units, hashes, extractor, metrics, public, seed)
 
@@ -406,11 +422,23 @@ def _protect(plan: Plan, cell: Cell, features: Features, content: str, *repetiti
     return release
 
 
-def _judged(plan: Plan, cell: Cell, unit: Unit, shots: tuple[Shot, ...], notes: Sequence[str], out: Path | None) -> Record:
+def trial(plan: Plan, cell: Cell, unit: Unit) -> Trial:
+    """A unit of a cell, extracted and protected as `execute` does it, before it is judged.
+
+    Raises
+    ------
+    UnitError
+        if it cannot be read, has no keypoint, or a plugin breaks.
+    """
+    shots = tuple(_shot(plan, cell, unit, number, _observed(plan, image)) for number, image in enumerate(unit.images))
+    return _trial(plan, cell, unit, shots)
+
+
+def _trial(plan: Plan, cell: Cell, unit: Unit, shots: tuple[Shot, ...]) -> Trial:
     head = cell.head
     content = plan.hashes[unit.name]
     first = shots[0].secret
-    trial = Trial(
+    return Trial(
         unit=unit,
         shots=shots,
         defense=cell.defense,
@@ -421,10 +449,15 @@ def _judged(plan: Plan, cell: Cell, unit: Unit, shots: tuple[Shot, ...], notes: 
         rng=randomness("attack", plan.seed, content, head["defense"], head["dataset"]["extractor"], head["attack"]),
         others=cell.population.without(unit.name),
         repeats=tuple(_protect(plan, cell, first, content, number) for number in _repetitions(cell.attack)),
+        carry_out=plan.carry_out,
     )
+
+
+def _judged(plan: Plan, cell: Cell, unit: Unit, shots: tuple[Shot, ...], notes: Sequence[str], out: Path | None) -> Record:
+    tried = _trial(plan, cell, unit, shots)
     started = time.perf_counter()
     with blamed(f"task {plan.task.name()}"):
-        outcome = plan.task.judge(trial)
+        outcome = plan.task.judge(tried)
     keypoints = max(len(shot.secret) for shot in shots)
     record = _record(cell, unit, status="ok", outcome=outcome, keypoints=keypoints, notes=notes)
     record["seconds"] = time.perf_counter() - started
@@ -463,13 +496,13 @@ def _record(
         "status": status,
         "reason": reason,
         "metrics": {} if outcome is None else {**outcome.metrics, "keypoints": keypoints},
-        "privacy": _privacy(cell, keypoints),
+        "privacy": privacy(cell, keypoints),
         "seconds": None,
         "notes": [*notes, *(outcome.notes if outcome else ())],
     }
 
 
-def _privacy(cell: Cell, keypoints: int | None) -> dict[str, Any]:
+def privacy(cell: Cell, keypoints: int | None) -> dict[str, Any]:
     """What the defense promises of what is released of one image, and what nothing covers."""
     epsilon, remembers = cell.privacy.epsilon, cell.defense.remembers()
     # A device that remembers answers once, however often it is asked.
