@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from bench import composition, environment, pool, records, registry, spec, units
+from bench import composition, environment, fields, pool, records, registry, spec, units
 from bench.datasets.photographs import Source
 from bench.errors import PluginError, UnitError, UserError, blamed
 from bench.features import kept
@@ -74,6 +74,7 @@ class Asked:
     extractor: Extractor
     dataset: Dataset | None
     seed: int
+    metrics: tuple[Metric, ...] = ()  # beside those that need nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +111,7 @@ def run(
     task: Task | None = None,
     dataset: Dataset | None = None,
     seed: int = 0,
+    metrics: Sequence[Metric] = (),
     out: Path | str | None = None,
 ) -> list[Record]:
     """Run every defense against every attack, and return one record for each unit, such as a photograph, of each pair.
@@ -122,6 +124,7 @@ def run(
     task : `Reconstruction()` if None
     dataset : the place that it is about, for a task that is about one
     seed : of everything random. A release whose seed is known is for measuring and protects nobody.
+    metrics : those that must be told something, such as a file, beside all that need not be
     out : a folder to keep records and reconstructions in; what it holds already is not done again
 
     Raises
@@ -129,7 +132,7 @@ def run(
     UserError
         if something is wrong with what was asked; nothing has been written then.
     """
-    plan = prepare(defenses, attacks, images, extractor=extractor, task=task, dataset=dataset, seed=seed)
+    plan = prepare(defenses, attacks, images, extractor=extractor, task=task, dataset=dataset, seed=seed, metrics=metrics)
     return list(execute(plan, None if out is None else Path(out)))
 
 
@@ -142,6 +145,7 @@ def prepare(
     task: Task | None = None,
     dataset: Dataset | None = None,
     seed: int = 0,
+    metrics: Sequence[Metric] = (),
 ) -> Plan:
     """Check what was asked, and lay out what is to be done. Parameters as those of `run`.
 
@@ -159,7 +163,7 @@ def prepare(
         raise UserError(f"{task.name()} judges the release itself and takes no attack")
     tried: Sequence[Attack | None] = attacks or [None]
     pairs = [(defense, attack) for defense in defenses for attack in tried]
-    return prepare_pairs(pairs, images, extractor=extractor, task=task, dataset=dataset, seed=seed)
+    return prepare_pairs(pairs, images, extractor=extractor, task=task, dataset=dataset, seed=seed, metrics=metrics)
 
 
 def prepare_pairs(
@@ -170,6 +174,7 @@ def prepare_pairs(
     extractor: Extractor | None = None,
     dataset: Dataset | None = None,
     seed: int = 0,
+    metrics: Sequence[Metric] = (),
 ) -> Plan:
     """As `prepare`, for these pairs of a defense and an attack instead of all; None where the task judges the release itself.
 
@@ -178,7 +183,15 @@ def prepare_pairs(
     UserError
         as `prepare`.
     """
-    asked = Asked(pairs=tuple(pairs), images=images, task=task, extractor=extractor or Sift(), dataset=dataset, seed=seed)
+    asked = Asked(
+        pairs=tuple(pairs),
+        images=images,
+        task=task,
+        extractor=extractor or Sift(),
+        dataset=dataset,
+        seed=seed,
+        metrics=tuple(metrics),
+    )
     plan = planned(asked)
     if all(cell.reason for cell in plan.cells):
         raise UserError("nothing to run: " + "; ".join(sorted({str(cell.reason) for cell in plan.cells})))
@@ -204,7 +217,7 @@ def planned(asked: Asked) -> Plan:
         "hash": units.digest(hashes | dict(collection.beside)),
         "extractor": spec.configuration(extractor, public),
     }
-    metrics = tuple(metric() for metric in registry.everything(registry.METRIC)) if task.attacked else ()
+    metrics = (*_metrics(), *asked.metrics) if task.attacked else ()
     settings = {metric.name(): _settings(metric) for metric in metrics}
     taking_part = [plugin for pair in asked.pairs for plugin in pair if plugin is not None]
     ran = environment.describe([task, extractor, *taking_part, *metrics])
@@ -275,10 +288,17 @@ def randomness(*parts: Any) -> np.random.Generator:
     return np.random.default_rng(int(hashlib.sha256(records.canonical(parts).encode()).hexdigest(), 16))
 
 
+def _metrics() -> Iterator[Metric]:
+    """All that need not be told anything."""
+    for metric in registry.everything(registry.METRIC):
+        if not fields.without_default(metric):
+            yield metric()
+
+
 def _settings(plugin: Plugin) -> dict[str, Any]:
-    fields = spec.written(plugin)
-    del fields["name"]
-    return fields | (dict(plugin.parameters) if isinstance(plugin, Metric) else {})
+    settings = spec.written(plugin)
+    del settings["name"]
+    return settings | (dict(plugin.parameters) if isinstance(plugin, Metric) else {})
 
 
 def _attack_configuration(

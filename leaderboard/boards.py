@@ -7,6 +7,8 @@ more, where each unit counts with its mean over the seeds. Runs of one cell in s
 
 from __future__ import annotations
 
+import functools
+import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -53,9 +55,17 @@ class Cell:
         """Why it does not apply, if it does not."""
         return self.head["reason"] if self.head["status"] == "n/a" else None
 
-    @property
+    @functools.cached_property
     def done(self) -> list[Record]:
         return [one.record for one in self.found if one.record["status"] == "ok"]
+
+    @functools.cached_property
+    def by_unit(self) -> list[list[Record]]:
+        """What is done, together for each unit."""
+        units: dict[str, list[Record]] = {}
+        for record in self.done:
+            units.setdefault(record["unit"], []).append(record)
+        return list(units.values())
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -100,8 +110,7 @@ class Board:
 
     def whole(self, cell: Cell) -> list[list[Record]]:
         """The records of each unit that the cell has done with every seed."""
-        by_unit = _grouped(cell.done, lambda record: record["unit"])
-        return [group for group in by_unit if len(group) == len(self.seeds)]
+        return [group for group in cell.by_unit if len(group) == len(self.seeds)]
 
     def values(self, cell: Cell, metric: str, condition: str | None = None) -> list[float | None]:
         """The value of each such unit, averaged over the seeds; of those of one condition if it is given."""
@@ -126,9 +135,12 @@ def find(results: Path) -> list[Found]:
         if there is none, or a file is damaged; the message names the file and the line.
     """
     paths = sorted(results.rglob(FILE)) if results.is_dir() else [files.find(results)]
-    latest = {
-        (record["run_hash"], record["unit"]): Found(record, path.parent) for path in paths for record in files.read(path).records
-    }
+    latest: dict[tuple[str, str], Found] = {}
+    for path in paths:
+        contents = files.read(path)
+        if contents.notice:
+            logging.getLogger(__name__).warning(contents.notice)
+        latest |= {(record["run_hash"], record["unit"]): Found(record, path.parent) for record in contents.records}
     if not latest:
         raise UserError(f"--results {results}: there is no record in it (looked for files called {FILE})")
     return list(latest.values())
@@ -144,7 +156,9 @@ def boards(found: Sequence[Found]) -> list[Board]:
             shared = [cell for cell in together if {one.record["seed"] for one in cell} == set(seeds)]
             made += [_board(shared, seeds)] if shared else []
         for seed in seeds:
-            made.append(_board([part for cell in together if (part := [one for one in cell if one.record["seed"] == seed])], (seed,)))
+            made.append(
+                _board([part for cell in together if (part := [one for one in cell if one.record["seed"] == seed])], (seed,))
+            )
     return sorted(made, key=lambda board: (not board.attacked, board.head["task"], board.head["dataset"]["name"]))
 
 
@@ -167,7 +181,7 @@ def _board(cells: Sequence[Sequence[Found]], seeds: tuple[int, ...]) -> Board:
     )
     done = [record for cell in made for record in cell.done]
     named = {name for record in done for name, value in record["metrics"].items() if value is not None}
-    conditions = tuple(sorted({record.get("condition") for record in done} - {None})) or (None,)
+    conditions = tuple(sorted({str(told) for record in done if (told := record.get("condition")) is not None})) or (None,)
     return Board(
         cells=made,
         seeds=seeds,

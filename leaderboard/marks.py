@@ -1,12 +1,13 @@
-"""How the families of defenses are told apart in a plot: by the shape of their marks and the style of their lines first, by colour last.
+"""How families of defenses are told apart in a plot: by the shapes of marks and the styles of lines first, by colour last.
 
-The colours are Okabe and Ito's, which people with any kind of colour blindness can tell, in an order that also differs in grey.
+The colours are Okabe and Ito's, which people with any kind of colour blindness can tell.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ class Mark:
     marker: str
     path: str
     colour: str
-    line: str
+    line: Any
 
 
 MARKS = (
@@ -27,9 +28,11 @@ MARKS = (
     Mark("s", "M-4.5,-4.5H4.5V4.5H-4.5Z", "#d55e00", "--"),
     Mark("^", "M0,-5.6L5.4,4.4H-5.4Z", "#009e73", "-."),
     Mark("D", "M0,-6L6,0L0,6L-6,0Z", "#cc79a7", ":"),
-    Mark("v", "M0,5.6L5.4,-4.4H-5.4Z", "#56b4e9", (0, (5, 1))),  # type: ignore[arg-type]
-    Mark("P", "M-1.8,-5.4H1.8V-1.8H5.4V1.8H1.8V5.4H-1.8V1.8H-5.4V-1.8H-1.8Z", "#e69f00", (0, (1, 1))),  # type: ignore[arg-type]
-    Mark("X", "M-5,-2.6L-2.6,-5L0,-2.4L2.6,-5L5,-2.6L2.4,0L5,2.6L2.6,5L0,2.4L-2.6,5L-5,2.6L-2.4,0Z", "#000000", (0, (3, 1, 1, 1))),  # type: ignore[arg-type]
+    Mark("v", "M0,5.6L5.4,-4.4H-5.4Z", "#56b4e9", (0, (5, 1))),
+    Mark("P", "M-1.8,-5.4H1.8V-1.8H5.4V1.8H1.8V5.4H-1.8V1.8H-5.4V-1.8H-1.8Z", "#e69f00", (0, (1, 1))),
+    Mark(
+        "X", "M-5,-2.6L-2.6,-5L0,-2.4L2.6,-5L5,-2.6L2.4,0L5,2.6L2.6,5L0,2.4L-2.6,5L-5,2.6L-2.4,0Z", "#000000", (0, (3, 1, 1, 1))
+    ),
 )
 
 

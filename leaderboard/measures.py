@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import math
 import re
@@ -50,6 +51,11 @@ def summary(of: Measure, values: Sequence[float | None]) -> Interval | None:
 
     A median has no interval: its ends are infinite.
     """
+    return _summary(of, tuple(values))
+
+
+@functools.lru_cache(maxsize=1 << 14)  # tables, ranks and plots ask for the same ones
+def _summary(of: Measure, values: tuple[float | None, ...]) -> Interval | None:
     known = [value for value in values if value is not None]
     if not known:
         return None

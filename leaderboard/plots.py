@@ -1,4 +1,4 @@
-"""Plots of boards, to be read in print, in grey, and by people who tell few colours: marks and line styles differ, not colour alone."""
+"""Plots of boards, for print, for grey, and for people who tell few colours: marks and line styles differ, not colour alone."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 TRADEOFF = "tradeoff"  # begins the names of the plots that the page draws itself
+BRIEF = 48  # letters of a label
 ROW = 0.3  # inches a defense
 LETTER = 3.9, 9.0  # points that a letter of a label is wide and high
 
@@ -37,7 +38,7 @@ def plots(board: Board, found: Sequence[Tradeoff]) -> Iterator[tuple[str, Figure
 
 
 def tradeoff(found: Tradeoff) -> Figure:
-    """Every defense with every setting: its utility to the right, what the strongest attack sees upwards; with the Pareto front."""
+    """Every defense and setting: its utility to the right, what the strongest attack sees upwards; with the Pareto front."""
     figure, axes = _axes(7.2, 4.6, found.caption)
     for family, mark in family_marks(found).items():
         of_it = [point for point in found.points if point.standing.configuration["name"] == family]
@@ -61,7 +62,9 @@ def attacks(board: Board, ranked: Sequence[Standing]) -> Figure:
     (privacy,) = measures([PRIVACY])
     names = list(dict.fromkeys(cell.attack for one in ranked for cell in one.cells if board.average(cell, privacy)))
     height = ROW * len(ranked) * max(1.0, len(names) / 3)
-    figure, axes = _axes(9.0, 1.2 + height, f"{', '.join([board.title, *board.facts[:3]])}. Filled: the strongest attack on that defense")
+    figure, axes = _axes(
+        9.0, 1.2 + height, f"{', '.join([board.title, *board.facts[:3]])}. Filled: the strongest attack on that defense"
+    )
     for place, (name, mark) in enumerate(marks(names).items()):
         beside = (place - (len(names) - 1) / 2) / (len(names) + 1)
         for filled in (True, False):
@@ -72,7 +75,7 @@ def attacks(board: Board, ranked: Sequence[Standing]) -> Figure:
                 if cell.attack == name and (cell is one.strongest) == filled and (score := board.average(cell, privacy))
             ]
             _scatter(axes, at, mark, filled=filled, label=None)
-        axes.plot([], [], mark.marker, color=mark.colour, mfc="white", label=drawable(name))
+        axes.plot([], [], mark.marker, color=mark.colour, mfc="white", label=_brief(name))
     axes.set_yticks(range(len(ranked)), [_ranked(one) for one in ranked], fontsize=8)
     axes.set_ylim(len(ranked) - 0.5, -0.5)
     axes.set_xlabel(f"{privacy.label} →", fontsize=9)
@@ -87,7 +90,16 @@ def epsilon(board: Board, curves: dict[str, list[Standing]]) -> Figure:
     for (label, curve), mark in zip(curves.items(), marks(curves).values(), strict=True):
         at = [_epsilon(one) for one in curve]
         scores = [one.score for one in curve if one.score]
-        axes.plot(at, [score.mean for score in scores], color=mark.colour, marker=mark.marker, ls=mark.line, ms=5, lw=1.3, label=drawable(label))
+        axes.plot(
+            at,
+            [score.mean for score in scores],
+            color=mark.colour,
+            marker=mark.marker,
+            ls=mark.line,
+            ms=5,
+            lw=1.3,
+            label=_brief(label),
+        )
         low, high = [score.low for score in scores], [score.high for score in scores]
         if all(map(math.isfinite, low)):
             axes.fill_between(at, low, high, color=mark.colour, alpha=0.12, lw=0)
@@ -109,7 +121,9 @@ def settings(found: Tradeoff) -> list[str]:
     for one in configurations:
         same_family = [other for other in configurations if other["name"] == one["name"]]
         differing = [name for name in one if len({canonical(other.get(name)) for other in same_family}) > 1]
-        texts.append(" ".join([one["name"], *(f"{'ε' if name == 'epsilon' else name} {setting(one[name])}" for name in differing)]))
+        texts.append(
+            " ".join([one["name"], *(f"{'ε' if name == 'epsilon' else name} {setting(one[name])}" for name in differing)])
+        )
     return texts
 
 
@@ -156,7 +170,7 @@ def _scatter(axes: Axes, at: Sequence[tuple[Interval, Interval]], mark: Mark, *,
         mfc=mark.colour if filled else "white",
         ms=6,
         lw=0.7,
-        label=label and drawable(label),
+        label=label and _brief(label),
         zorder=3,
     )
 
@@ -173,12 +187,17 @@ def _write_settings(axes: Axes, found: Tradeoff) -> None:
     within = axes.transAxes.inverted().transform(axes.transData.transform(means))  # (n, 2) from 0 to 1
     points = [(x * size[0], (1 - y) * size[1]) for x, y in within]
     texts = settings(found)
-    sizes = [(LETTER[0] * len(text), LETTER[1]) for text in texts]
+    sizes = [(LETTER[0] * min(len(text), BRIEF), LETTER[1]) for text in texts]
     for text, place in zip(texts, place_labels(points, sizes, size), strict=True):
         if place:
             left, up = place[0] / size[0], 1 - place[1] / size[1]
-            axes.text(left, up, drawable(text), fontsize=7, color="0.2", va="center", transform=axes.transAxes)
+            axes.text(left, up, _brief(text), fontsize=7, color="0.2", va="center", transform=axes.transAxes)
 
 
 def _ranked(standing: Standing) -> str:
-    return drawable(f"{standing.rank}  {standing.defense}" if standing.rank is not None else f"unranked  {standing.defense}")
+    return _brief(f"{standing.rank}  {standing.defense}" if standing.rank is not None else f"unranked  {standing.defense}")
+
+
+def _brief(text: str) -> str:
+    """Text that leaves room for the plot."""
+    return drawable(text if len(text) <= BRIEF else text[: BRIEF - 1] + "…")

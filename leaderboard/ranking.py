@@ -9,7 +9,7 @@ from typing import Any
 
 from bench.records import canonical
 from leaderboard.boards import Board, Cell
-from leaderboard.measures import PRIVACY, measures
+from leaderboard.measures import PRIVACY, Measure, measures
 from leaderboard.reproduce.intervals import Interval
 
 # The attack whose network is trained for the very defense. Attackers that were made for another one make a defense look safe.
@@ -37,7 +37,8 @@ def standings(board: Board) -> list[Standing]:
     groups: dict[str, list[Cell]] = {}
     for cell in board.cells:
         groups.setdefault(canonical(cell.head["defense"]), []).append(cell)
-    found = [_standing(board, cells) for cells in groups.values()]
+    (privacy,) = measures([PRIVACY])
+    found = [_standing(board, cells, privacy) for cells in groups.values()]
     ranked = sorted((one for one in found if one.unranked is None), key=_score)
     better = [sum(_score(other) < _score(one) for other in ranked) for one in ranked]
     return [
@@ -46,8 +47,7 @@ def standings(board: Board) -> list[Standing]:
     ]
 
 
-def _standing(board: Board, cells: Sequence[Cell]) -> Standing:
-    (privacy,) = measures([PRIVACY])
+def _standing(board: Board, cells: Sequence[Cell], privacy: Measure) -> Standing:
     scores = [(score, cell) for cell in cells if (score := board.average(cell, privacy)) is not None]
     score, strongest = max(scores, key=lambda pair: pair[0].mean, default=(None, None))
     return Standing(

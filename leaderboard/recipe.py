@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import shlex
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +17,7 @@ from bench.registry import Kind
 from leaderboard.boards import Cell
 
 BUILTIN = "builtin"  # the photographs that need no --images
+Lookup = Callable[[Kind, str], type[Plugin] | None]
 HERE = "reconstruction", "dia"  # the default task, and what paints the descriptors there
 
 
@@ -28,22 +29,32 @@ class Recipe:
     needs: tuple[str, ...]
 
 
-def recipe(cell: Cell) -> Recipe:
+def installed(kind: Kind, name: str) -> type[Plugin] | None:
+    """The plugin of that name, if it is here."""
+    try:
+        found: type[Plugin] = registry.lookup(kind, name)
+    except UserError:
+        return None
+    return found
+
+
+def recipe(cell: Cell, lookup: Lookup = installed) -> Recipe:
     """`bench run` with all that the records say; files of the user's own stand there as FILE, and `needs` tells their digests.
 
-    A plugin that is not installed here has all its recorded fields spelt out.
+    A plugin that is not installed here has all its recorded fields spelt out. Many cells share a cached `lookup`.
     """
-    head = cell.head
+    head, spec = cell.head, functools.partial(_spec, lookup)
     needs: dict[str, None] = {}
-    options = [("--task", _task(head)), ("--defense", _spec(registry.DEFENSE, head["defense"], needs))]
+    options = [("--task", _task(head)), ("--defense", spec(registry.DEFENSE, head["defense"], needs))]
     if head["attack"] is not None:
-        options.append(("--attack", _spec(registry.ATTACK, head["attack"], needs)))
-    options.append(("--extractor", _spec(registry.EXTRACTOR, head["dataset"]["extractor"], needs)))
+        options.append(("--attack", spec(registry.ATTACK, head["attack"], needs)))
+    options.append(("--extractor", spec(registry.EXTRACTOR, head["dataset"]["extractor"], needs)))
     if head["dataset"].get("spec"):
-        options.append(("--dataset", _spec(registry.DATASET, head["dataset"]["spec"], needs)))
+        options.append(("--dataset", spec(registry.DATASET, head["dataset"]["spec"], needs)))
     elif head["dataset"]["name"] != BUILTIN:
         options.append(("--images", str(head["dataset"]["name"])))
         needs[f"{head['dataset']['name']}: a folder of the photographs with the content {head['dataset']['hash']}"] = None
+    options += [("--metric", text) for text in _metrics(lookup, head["metric_settings"], needs)]
     seeds = sorted({one.record["seed"] for one in cell.found})
     default = {"--task": HERE[0], "--extractor": "sift"}
     words = ["bench run", *(_option(option, text) for option, text in options if default.get(option) != text)]
@@ -61,9 +72,17 @@ def _task(head: Record) -> str:
     return str(head["task"]) if painter == HERE[1] else f"{head['task']}:inverter={painter}"
 
 
-def _spec(kind: Kind, configuration: Mapping[str, Any], needs: dict[str, None]) -> str:
+def _metrics(lookup: Lookup, settings: Mapping[str, Mapping[str, Any]], needs: dict[str, None]) -> Iterator[str]:
+    """Those that are measured only where they are asked for."""
+    for name, content in settings.items():
+        plugin = lookup(registry.METRIC, name)
+        if plugin and fields.without_default(plugin):
+            yield _spec(lookup, registry.METRIC, {"name": name, **content}, needs)
+
+
+def _spec(lookup: Lookup, kind: Kind, configuration: Mapping[str, Any], needs: dict[str, None]) -> str:
     """A plugin as the command line takes it, without the fields that are as they are by default."""
-    plugin = _installed(kind, configuration["name"])
+    plugin = lookup(kind, configuration["name"])
     defaults = fields.defaults(plugin) if plugin else {}
     given = []
     for field, value in configuration.items():
@@ -75,14 +94,6 @@ def _spec(kind: Kind, configuration: Mapping[str, Any], needs: dict[str, None]) 
             if text == "FILE":
                 needs[f"FILE for {field} of {configuration['name']}: {value}"] = None
     return configuration["name"] + (":" + ",".join(given) if given else "")
-
-
-def _installed(kind: Kind, name: str) -> type[Plugin] | None:
-    try:
-        found: type[Plugin] = registry.lookup(kind, name)
-    except UserError:
-        return None
-    return found
 
 
 def _text(value: Any) -> str:

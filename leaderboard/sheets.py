@@ -98,15 +98,17 @@ def middle(value: Value) -> float | None:
     return float(value) if isinstance(value, int | float) else None
 
 
-def shown(column: Column, value: Value) -> str:
+def shown(column: Column, row: Row) -> str:
     """A value as people read it."""
+    value = row.values[column.name]
     if value is None:
         return NOT_APPLICABLE
     if column.log10 and isinstance(value, float):
         return chance(value)
     if isinstance(value, Interval):
         ends = f" [{number(value.low)}, {number(value.high)}]" if math.isfinite(value.low) else ""
-        return number(value.mean) + ends
+        of_fewer = f" (n = {value.count})" if value.count != row.values["units"] else ""
+        return number(value.mean) + ends + of_fewer
     return number(value) if isinstance(value, float) else str(value)
 
 
@@ -235,9 +237,7 @@ def _row(board: Board, columns: Sequence[Column], cell: Cell, standing: Standing
         "attack": cell.attack,
         "log10_true": None if privacy["log10_true"] is None else float(privacy["log10_true"]),
         "units": whole,
-    } | {
-        _name(measure, condition): board.average(cell, measure, condition) for measure, condition in _measured(board)
-    }
+    } | {_name(measure, condition): board.average(cell, measure, condition) for measure, condition in _measured(board)}
     strongest = standing is not None and cell is (standing.strongest or standing.cells[0])
     return Row(
         values={column.name: values[column.name] for column in columns},
@@ -272,7 +272,7 @@ def _texts(sheet: Sheet, row: Row, notes: dict[str, int], escape: Callable[[str]
     """The row as text, with the number of its note behind the defense's name. What is no number is escaped."""
     for column in sheet.columns:
         value = row.values[column.name]
-        text = escape(value) if isinstance(value, str) else shown(column, value)
+        text = escape(value) if isinstance(value, str) else shown(column, row)
         yield column, f"{text} [{notes[row.note]}]" if column.name == "defense" and row.note else text
 
 
@@ -308,7 +308,6 @@ _LATEX = {letter: f"\\{letter}" for letter in "{}$&#_%"} | {
     "τ": r"$\tau$",
     "∞": r"$\infty$",
     "°": r"$^\circ$",
-    "−": "$-$",
     "`": r"\textasciigrave{}",
     "[": "{[}",  # so that a row which begins with it is not read as an argument of the line before
     "]": "{]}",

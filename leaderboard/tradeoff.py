@@ -76,16 +76,19 @@ def pareto(cost: ArrayLike, gain: ArrayLike) -> NDArray[np.bool_]:
     costs, gains = np.asarray(cost, dtype=np.float64), np.asarray(gain, dtype=np.float64)
     no_worse = (costs[None] <= costs[:, None]) & (gains[None] >= gains[:, None])
     better = (costs[None] < costs[:, None]) | (gains[None] > gains[:, None])
-    return ~(no_worse & better).any(axis=1)
+    return np.logical_not(np.logical_and(no_worse, better).any(axis=1))
 
 
 def _tradeoff(attacked: Board, served: Board, utility: Measure, condition: str | None) -> Tradeoff:
     (privacy,) = measures([PRIVACY])
+    whole = [cell for cell in served.cells if not cell.reason and not served.missing(cell)]
     pairs = []
     for standing in standings(attacked):
-        cell, strongest = _same_defense(standing, served), standing.strongest
+        cell, strongest = _same_defense(standing, whole), standing.strongest
         gained = served.average(cell, utility, condition) if cell else None
-        seen = attacked.average(strongest, privacy, condition if condition in attacked.conditions else None) if strongest else None
+        seen = (
+            attacked.average(strongest, privacy, condition if condition in attacked.conditions else None) if strongest else None
+        )
         if cell and strongest and gained and seen:
             pairs.append((standing, strongest, cell, seen, gained))
     ranked = [pair for pair in pairs if pair[0].rank is not None]  # an unranked one may look more private than it is
@@ -106,17 +109,16 @@ def _tradeoff(attacked: Board, served: Board, utility: Measure, condition: str |
     return Tradeoff(attacked=attacked, served=served, condition=condition, privacy=privacy, utility=utility, points=points)
 
 
-def _same_defense(standing: Standing, served: Board) -> Cell | None:
-    """The cell of the same defense with the same setting.
+def _same_defense(standing: Standing, served: Sequence[Cell]) -> Cell | None:
+    """The cell of a server's board with the same defense and setting.
 
     On other data a defense may have other files, such as the dictionary of the place that is served: there it is the same if all
     else is, and no second one is so, too.
     """
-    whole = [cell for cell in served.cells if not served.missing(cell) and not cell.reason]
-    equal = [cell for cell in whole if cell.head["defense"] == standing.configuration]
-    if equal or served.head["dataset"]["hash"] == standing.cells[0].head["dataset"]["hash"]:
+    equal = [cell for cell in served if cell.head["defense"] == standing.configuration]
+    if equal or any(cell.head["dataset"]["hash"] == standing.cells[0].head["dataset"]["hash"] for cell in served):
         return equal[0] if equal else None
-    alike = [cell for cell in whole if _without_files(cell.head["defense"]) == _without_files(standing.configuration)]
+    alike = [cell for cell in served if _without_files(cell.head["defense"]) == _without_files(standing.configuration)]
     return alike[0] if len(alike) == 1 else None
 
 

@@ -78,12 +78,16 @@ def record(
 def reconstructions(defense: dict[str, Any], scores: Sequence[float], **more: Any) -> list[dict[str, Any]]:
     """One record for each score, which is an SSIM; units 0.png, 1.png, ..."""
     return [
-        record(f"{number}.png", {"ssim": score, "mae": round(0.6 - score / 2, 4), "keypoints": 100 + number}, defense=defense, **more)
+        record(
+            f"{number}.png", {"ssim": score, "mae": round(0.6 - score / 2, 4), "keypoints": 100 + number}, defense=defense, **more
+        )
         for number, score in enumerate(scores)
     ]
 
 
-def localizations(defense: dict[str, Any], found: Sequence[int], conditions: Sequence[str | None], **more: Any) -> list[dict[str, Any]]:
+def localizations(
+    defense: dict[str, Any], found: Sequence[int], conditions: Sequence[str | None], **more: Any
+) -> list[dict[str, Any]]:
     """One record for each query: whether it is localized, and under which condition."""
     given = {"task": "localization", "attack": None, "dataset": GALLERY} | more
     return [

@@ -80,9 +80,7 @@ def test_seeds_have_boards_of_their_own_and_one_of_their_mean(tmp_path: Path) ->
 
 def test_a_unit_that_one_seed_lacks_is_not_averaged(tmp_path: Path) -> None:
     other = reconstructions(ldp(8.0), [0.3, 0.5], seed=1), reconstructions(ldp(8.0), [0.3, 0.5], seed=2)
-    averaged, *_ = made(
-        tmp_path, reconstructions(NONE, [0.5, 0.9], seed=1), reconstructions(NONE, [0.3], seed=2), *other
-    )
+    averaged, *_ = made(tmp_path, reconstructions(NONE, [0.5, 0.9], seed=1), reconstructions(NONE, [0.3], seed=2), *other)
     assert averaged.values(averaged.cells[0], "ssim") == [pytest.approx(0.4)]
     assert averaged.missing(averaged.cells[0]) == 1
     assert by_defense(averaged)["none"].unranked == "dia has done 1 of 2"

@@ -217,7 +217,7 @@ def test_faces_are_those_of_scikit_image(portrait: np.ndarray) -> None:
 
 def test_overlap_is_the_share_of_pixels_counted_one_by_one() -> None:
     rng = np.random.default_rng(4)
-    one, other = (rng.integers(0, 20, (50, 4)) + [0, 0, 1, 1] for _ in range(2))
+    one, other = (rng.integers((0, 0, 1, 1), (20, 20, 21, 21), (50, 4)) for _ in range(2))
 
     def pixels(box: np.ndarray) -> set[tuple[int, int]]:
         top, left, height, width = box

@@ -82,6 +82,17 @@ def test_a_single_photograph_has_no_interval(tmp_path: Path) -> None:
     assert (row["ssim"], row["ssim_low"]) == ("0.5", "n/a")
 
 
+def test_what_only_some_photographs_have_tells_how_many(tmp_path: Path) -> None:
+    """Such as the share of faces that are found again, where few photographs show one."""
+    records = reconstructions(NONE, [0.5, 0.6, 0.7])
+    for record, face in zip(records, (None, 1.0, 0.0), strict=True):
+        record["metrics"]["face"] = face
+    (found,) = boards.boards(boards.find(fabricated.write(tmp_path, records)))
+    (row,) = sheets.pairs(found).rows
+    (column,) = (column for column in sheets.pairs(found).columns if column.name == "face")
+    assert sheets.shown(column, row) == "0.5 [0, 1] (n = 2)"
+
+
 def test_latex_is_booktabs_of_even_rows(board: Board) -> None:
     written = sheets.to_latex(sheets.pairs(board))
     assert all(rule in written for rule in (r"\toprule", r"\midrule", r"\bottomrule"))
@@ -137,4 +148,7 @@ def test_tables_of_a_server_are_led_by_what_it_is_judged_by(tmp_path: Path) -> N
     assert "attack" not in names
     assert names.index("recall_0.25m_2deg_day") < names.index("translation_error_day") < names.index("inliers")
     assert [row.values["defense"] for row in sheet.rows] == ["none", "ldp:epsilon=8,subset_size=2"]
-    assert [sheet.is_best(next(c for c in sheet.columns if c.name == "recall_0.25m_2deg_day"), row) for row in sheet.rows] == [True, False]
+    assert [sheet.is_best(next(c for c in sheet.columns if c.name == "recall_0.25m_2deg_day"), row) for row in sheet.rows] == [
+        True,
+        False,
+    ]

@@ -6,7 +6,7 @@ from typing import Any
 import fabricated
 import numpy as np
 import pytest
-from fabricated import DIA, ENVIRONMENT, GALLERY, PHOTOGRAPHS, inapplicable, ldp, localizations, record, reconstructions
+from fabricated import DIA, ENVIRONMENT, GALLERY, PHOTOGRAPHS, inapplicable, ldp, localizations, reconstructions, record
 
 from leaderboard import boards, plots
 from leaderboard.boards import Board
@@ -75,7 +75,9 @@ def test_on_other_data_the_words_may_be_that_places_own(tmp_path: Path) -> None:
     (one,) = joined(tmp_path, reconstructions(ldp(8.0), [0.3]), localizations(own, [1], [None]))
     assert one.caption.endswith("words of a dictionary are those of each")
     other = own | {"dictionary": "sha256:" + "8" * 64}
-    assert not joined(tmp_path / "two", reconstructions(ldp(8.0), [0.3]), localizations(own, [1], [None]), localizations(other, [0], [None]))
+    assert not joined(
+        tmp_path / "two", reconstructions(ldp(8.0), [0.3]), localizations(own, [1], [None]), localizations(other, [0], [None])
+    )
     same = PHOTOGRAPHS | {"name": "again"}
     assert not joined(tmp_path / "same", reconstructions(ldp(8.0), [0.3]), localizations(own, [1], [None], dataset=same))
 
@@ -117,7 +119,12 @@ def test_an_unranked_defense_is_shown_and_is_on_no_front(tmp_path: Path) -> None
 
 
 def test_families_differ_without_colour() -> None:
-    assert len({mark.marker for mark in MARKS}) == len({mark.path for mark in MARKS}) == len({str(mark.line) for mark in MARKS}) == len(MARKS)
+    assert (
+        len({mark.marker for mark in MARKS})
+        == len({mark.path for mark in MARKS})
+        == len({str(mark.line) for mark in MARKS})
+        == len(MARKS)
+    )
     assert list(marks(["b", "a", "b"])) == ["b", "a"]
 
 
@@ -129,8 +136,8 @@ def test_labels_cover_nothing() -> None:
     boxes = [(x, y - 6, x + 60, y + 6) for place in placed if place for x, y in [place]]
     assert len(boxes) > 6
     for number, (left, top, right, bottom) in enumerate(boxes):
-        assert 0 <= left
-        assert 0 <= top
+        assert left >= 0
+        assert top >= 0
         assert right <= 300
         assert bottom <= 300
         assert not any(left < x < right and top < y < bottom for x, y in points)

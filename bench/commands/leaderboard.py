@@ -25,4 +25,4 @@ def execute(args: argparse.Namespace) -> int:
     from leaderboard import site
 
     done = site.write(args.results, args.out)
-    return say(DONE, f"written to {done.page}: {done.boards} boards, {done.cells} cells, {done.records} records")
+    return say(DONE, f"written to {done.page} (boards: {done.boards}, cells: {done.cells}, records: {done.records})")

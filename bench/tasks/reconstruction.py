@@ -111,6 +111,8 @@ def offered(attack: Attack, defense: Defense, public: Public) -> dict[Knowledge,
     }
     if "database" in databases:
         offers[Knowledge.DATABASE] = lambda: public.dictionary(databases["database"])
+    if public.place is not None:
+        offers[Knowledge.MAP] = lambda: public.place
     return offers
 
 
@@ -121,6 +123,7 @@ def view(trial: Trial) -> View:
     offers = offered(attack, trial.defense, trial.public) | {
         Knowledge.OTHER_RELEASES: lambda: lambda count: map(copy.deepcopy, trial.others(count)),
         Knowledge.REPEATED_RELEASES: lambda: copy.deepcopy(list(trial.repeats)),
+        Knowledge.MAP: lambda: _served(trial),
     }
     return View(
         release=copy.deepcopy(trial.release),  # whatever the attack does to it, the next attack sees what was released
@@ -128,6 +131,12 @@ def view(trial: Trial) -> View:
         extractor=trial.extractor,
         knowledge={what: load for what, load in offers.items() if what in attack.needs},
     )
+
+
+def _served(trial: Trial) -> Any:
+    from bench.localization.server import Server  # it brings COLMAP with it
+
+    return Server(public=trial.public, camera=trial.unit.subject.camera)
 
 
 def reconstructed(attack: ImageAttack, seen: View, trial: Trial) -> Floats:

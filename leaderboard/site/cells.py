@@ -1,7 +1,8 @@
-"""What the page shows of one cell: its numbers, pictures, budget, configuration, environment and the command that makes it again."""
+"""What the page shows of one cell: numbers, pictures, budget, configuration, environment, and the command that makes it again."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,8 +11,8 @@ from typing import Any
 
 from bench.composition import DELTA
 from leaderboard.boards import Board, Cell
-from leaderboard.recipe import Recipe, recipe
 from leaderboard.measures import PRIVACY
+from leaderboard.recipe import Lookup, Recipe, recipe
 from leaderboard.reproduce.intervals import Interval
 from leaderboard.sheets import Column, Row, Sheet, Value, guarantee, middle, shown
 from leaderboard.site import pictures
@@ -58,38 +59,37 @@ def columns(sheet: Sheet) -> list[Column]:
     """Those that the page's table shows: what is judged, and what says of what it is."""
     head = ("rank", "defense", "guarantee", "epsilon_descriptor", "epsilon_image", "attack")
     return [
-        column
-        for column in sheet.columns
-        if column.name in (*head, "units") or (column.better and column.name not in UNTOLD)
+        column for column in sheet.columns if column.name in (*head, "units") or (column.better and column.name not in UNTOLD)
     ]
 
 
-def view(board: Board, sheet: Sheet, row: Row, found: Sequence[Tradeoff], out: Path) -> View:
+def view(board: Board, sheet: Sheet, row: Row, found: Sequence[Tradeoff], out: Path, lookup: Lookup) -> View:
     """Gather what there is to show of a row of the board, and copy its pictures into `out`."""
     cell = row.cell
     name, _, fields = cell.defense.partition(":")
     return View(
         row=row,
         label=(name, spaced(fields)),
-        texts={column.name: _parts(column, row.values[column.name]) for column in sheet.columns} | {"attack": (spaced(cell.attack), "")},
+        texts={column.name: _parts(column, row) for column in sheet.columns} | {"attack": (spaced(cell.attack), "")},
         values={column.name: _sorted_by(row.values[column.name]) for column in sheet.columns},
         best=frozenset(column.name for column in sheet.columns if sheet.is_best(column, row)),
         pictures=tuple(_pictures(board, cell, out)),
         budget=tuple(_budget(cell)),
         uncovered=tuple(map(str, cell.head["privacy"].get("uncovered", ()))),
-        recipe=recipe(cell),
+        recipe=recipe(cell, lookup),
         settings=tuple(_settings(cell)),
         failures=tuple(_failures(cell)),
         beside=tuple(_beside(cell, found)),
     )
 
 
-def _parts(column: Column, value: Value) -> tuple[str, str]:
+def _parts(column: Column, row: Row) -> tuple[str, str]:
     """The number, and its interval if it has one."""
-    if not isinstance(value, Interval):
-        return shown(column, value), ""
-    mean, _, ends = shown(column, value).partition(" ")
-    return mean, ends
+    text = shown(column, row)
+    if not isinstance(row.values[column.name], Interval):
+        return text, ""
+    mean, _, ends = text.partition(" ")
+    return mean, ends.replace(", ", ",\N{NO-BREAK SPACE}").replace(" = ", "\N{NO-BREAK SPACE}=\N{NO-BREAK SPACE}")
 
 
 def _sorted_by(value: Value) -> str:
@@ -146,7 +146,12 @@ def _flat(content: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, s
         if isinstance(value, Mapping):
             yield from _flat(value, f"{before}{name}.")
         else:
-            yield f"{before}{name}", ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+            yield f"{before}{name}", ", ".join(map(_plain, value)) if isinstance(value, list) else _plain(value)
+
+
+def _plain(value: Any) -> str:
+    """As records hold it."""
+    return value if isinstance(value, str) else json.dumps(value)
 
 
 def _failures(cell: Cell) -> Iterator[str]:

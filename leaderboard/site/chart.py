@@ -14,7 +14,7 @@ from leaderboard.tradeoff import Point, Tradeoff
 
 WIDTH, HEIGHT = 520, 380  # of the whole, in the units of its viewBox
 LEFT, RIGHT, TOP, BOTTOM = 54, 12, 12, 48  # margins of the plot in it
-LETTER = 6.4, 14.0  # width and height of a letter of a label
+LETTER = 7.4, 14.0  # width and height of a letter of a label
 TICKS = 5
 MARGIN = 0.12  # of the plot, around the points
 

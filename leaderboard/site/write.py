@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import functools
 import hashlib
 import re
 from collections.abc import Callable, Sequence
@@ -13,14 +14,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bench.environment import DISTRIBUTION
+from bench.errors import UserError
 from bench.progress import Progress
-from leaderboard import boards, plots, sheets
+from leaderboard import boards, plots, recipe, sheets
 from leaderboard.boards import Board
+from leaderboard.recipe import Lookup
 from leaderboard.reproduce.drawing import save
 from leaderboard.sheets import Sheet
 from leaderboard.site import cells
 from leaderboard.site.chart import charts
-from leaderboard.tradeoff import Tradeoff, tradeoffs
+from leaderboard.tradeoff import tradeoffs
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -45,22 +48,26 @@ def write(results: Path, out: Path) -> Done:
     Raises
     ------
     UserError
-        if there is no record, or a damaged one; nothing has been written then.
+        if there is no record, or a damaged one, or `out` is no folder; nothing has been written then.
     OSError
         if it cannot be written.
     """
     found = boards.find(results)
     made = boards.boards(found)
-    out.mkdir(parents=True, exist_ok=True)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"--out: cannot write {out}: {error.strerror}") from error
     count = sum(len(board.cells) for board in made)
     with Progress(f"{len(made)} boards, {count} cells", count) as progress:
-        shown = [_board(board, made, out, progress) for board in made]
+        lookup = functools.cache(recipe.installed)
+        shown = [_board(board, made, out, progress, lookup) for board in made]
     page = out / PAGE
     page.write_text(_page(shown, len(found)), encoding="utf-8", errors="replace")
     return Done(page=page, boards=len(made), cells=count, records=len(found))
 
 
-def _board(board: Board, every: Sequence[Board], out: Path, progress: Progress) -> dict[str, Any]:
+def _board(board: Board, every: Sequence[Board], out: Path, progress: Progress, lookup: Lookup) -> dict[str, Any]:
     """All that the page shows of a board; its tables, plots and pictures are written."""
     found = tradeoffs(board, every) if board.attacked else []
     name = _file_name(board)
@@ -68,7 +75,7 @@ def _board(board: Board, every: Sequence[Board], out: Path, progress: Progress) 
     tables = {"pairs": sheet} | ({"ranking": sheets.ranking(board)} if board.attacked else {})
     shown = []
     for row in sheet.rows:
-        shown.append(cells.view(board, sheet, row, found, out))
+        shown.append(cells.view(board, sheet, row, found, out, lookup))
         progress.advance(note=board.title)
     return {
         "board": board,

@@ -17,7 +17,7 @@ for (const board of document.querySelectorAll(".board")) {
   const body = board.querySelector("tbody");
   const rows = [...body.rows]; // as listed: by rank
   const filter = board.querySelector(".filter");
-  const strongest = board.querySelector(".strongest");
+  const only = board.querySelector(".only"); // the strongest attack on each
   const sorting = board.querySelector(".sorting");
   const headers = [...board.querySelectorAll("thead th")];
   const texts = new Map(rows.map((row) => [row, row.textContent.toLowerCase()]));
@@ -38,7 +38,7 @@ for (const board of document.querySelectorAll(".board")) {
     const listed = column ? [...rows].sort(compare) : direction > 0 ? rows : [...rows].reverse();
     let count = 0;
     for (const row of listed) {
-      const wanted = !strongest || !strongest.checked || row.classList.contains("strongest");
+      const wanted = !only || !only.checked || row.classList.contains("strongest");
       row.hidden = !(wanted && words.every((word) => texts.get(row).includes(word)));
       count += !row.hidden;
     }
@@ -66,11 +66,18 @@ for (const board of document.querySelectorAll(".board")) {
     show();
   });
   filter.addEventListener("input", show);
-  if (strongest) strongest.addEventListener("change", show);
+  if (only) only.addEventListener("change", show);
   show();
 }
 
 // ---- cells: links open them, so that each has an address, and the keyboard and the way back work as everywhere
+
+let opener = null; // where the reader comes from: following a link takes the focus from it
+
+document.addEventListener("click", (event) => {
+  const link = event.target.closest('a[href^="#cell-"]');
+  if (link && !link.closest("dialog")) opener = link;
+});
 
 function openCell() {
   const wanted = location.hash.startsWith("#cell-") ? document.getElementById(location.hash.slice(1)) : null;
@@ -89,6 +96,7 @@ for (const dialog of document.querySelectorAll("dialog")) {
   });
   dialog.addEventListener("close", () => {
     if (location.hash === `#${dialog.id}`) history.replaceState(null, "", "#");
+    if (!document.querySelector("dialog[open]")) opener?.focus();
   });
   comparison(dialog);
   copying(dialog);
