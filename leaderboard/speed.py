@@ -2,8 +2,8 @@
 
 A time means little on another machine, and so does a ratio of two machines' times. A group of benchmarks holds floors, such as a
 bare product of matrices or another library's search, and the others are divided by the quickest of them, which is another one on
-another processor. pytest-benchmark compares times with those of earlier runs (`--benchmark-compare`), and knows no ratios within a
-run.
+another processor. pytest-benchmark compares times with those of earlier runs (`--benchmark-compare`), and knows no ratios within
+a run.
 """
 
 from __future__ import annotations
