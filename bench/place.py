@@ -52,7 +52,7 @@ class Place:
         UserError
             if no point could be triangulated.
         """
-        key = [self.digest, units.fingerprint(self.scene), cache.source(mapping, covisible)]
+        key = [self.digest, units.fingerprint(self.scene.references), cache.source(mapping, covisible)]
         arrays, meta = cache.fetch(maps.KIND, key, lambda: mapping.build(self.scene.references, self.references).to_arrays())
         return maps.from_arrays(arrays, meta)
 
