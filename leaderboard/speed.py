@@ -8,6 +8,7 @@ a run.
 
 from __future__ import annotations
 
+import functools
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -50,7 +51,7 @@ def ratios(path: Path) -> Ratios:
     groups: dict[str, dict[str, float]] = {}
     for one in found["benchmarks"]:
         groups.setdefault(str(one["group"]), {})[one["name"]] = one["stats"]["min"]
-    measured = {}
+    measured: dict[str, float] = {}
     for group, times in groups.items():
         floors = [time for name, time in times.items() if _is_floor(name)]
         if floors:
@@ -64,12 +65,12 @@ def compare(baseline: Ratios, measured: Ratios) -> list[Finding]:
 
 
 def _finding(name: str, before: float | None, after: float | None) -> Finding:
-    where = {"defense": name, "attack": "its floor"}
+    finding = functools.partial(Finding, defense=name, attack="its floor")
     if before is None or after is None:
-        return Finding(verdict="new" if before is None else "missing", **where)
+        return finding(verdict="new" if before is None else "missing")
     verdict: Verdict = "worse" if after > before * TOLERANCE else "better" if after < before / TOLERANCE else "same"
     allowed = before * (TOLERANCE - 1)
-    return Finding(verdict=verdict, **where, metric="time", before=before, after=after, tolerance=allowed)
+    return finding(verdict=verdict, metric="time", before=before, after=after, tolerance=allowed)
 
 
 def _is_floor(name: str) -> bool:
