@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from bench import cache, spec, units
+from bench import cache, pool, spec, units
 from bench.datasets.scene import Scene, SceneImage
 from bench.errors import UserError
 from bench.features import build, dictionary, kept
@@ -15,7 +15,6 @@ from bench.localization import covisible, mapping, maps
 from bench.localization.maps import Map
 from bench.localization.retrieval import Bags
 from bench.plugin import Extractor
-from bench.progress import Progress
 from bench.types import Features, Indices
 
 WORDS = 32_000  # of the dictionary, unless it is said how many
@@ -53,7 +52,7 @@ class Place:
         UserError
             if no point could be triangulated.
         """
-        key = [self.digest, units.fingerprint(self.scene), cache.source(mapping, covisible)]
+        key = [self.digest, units.fingerprint(self.scene.references), cache.source(mapping, covisible)]
         arrays, meta = cache.fetch(maps.KIND, key, lambda: mapping.build(self.scene.references, self.references).to_arrays())
         return maps.from_arrays(arrays, meta)
 
@@ -78,12 +77,7 @@ class Place:
         UnitError
             if one of them cannot be read.
         """
-        found = []
-        with Progress("reference images", len(self.scene.references)) as progress:
-            for image in self.scene.references:
-                found.append(self.features(image))
-                progress.advance(note=image.name)
-        return tuple(found)
+        return tuple(pool.extracted(self.extractor, [image.pixels for image in self.scene.references]))
 
     def dictionary(self, words: int) -> Dictionary:
         """So many words clustered from the references' descriptors; `WORDS` for 0.

@@ -1,7 +1,8 @@
-"""Processes on one machine that share its cores, each doing whole units of a plan that it made for itself."""
+"""Processes on one machine that share its cores: they extract features, or do whole units of a plan that each made for itself."""
 
 from __future__ import annotations
 
+import itertools
 import multiprocessing
 import os
 from collections.abc import Iterable, Iterator, Sequence
@@ -11,10 +12,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bench.errors import UserError
+from bench.progress import Progress
+from bench.types import Features, Knowledge
 
 if TYPE_CHECKING:
+    from bench.datasets.scene import Pixels
+    from bench.plugin import Extractor
     from bench.records import Record
     from bench.runner import Asked, Plan, Work
+
+
+FEW = 16  # images that are not worth processes of their own
 
 
 def share(workers: int) -> None:
@@ -38,6 +46,8 @@ def units(plan: Plan, out: Path | None, work: Sequence[Work], workers: int) -> I
     """
     import torch
 
+    if plan.public.place is not None and needs_map(plan):
+        _ = plan.public.place.map  # made once, before each process reads it
     places = {unit.name: place for place, unit in enumerate(plan.units)}
     # Processes are started afresh: a copy of one that has computed with several threads can hang.
     context = multiprocessing.get_context("spawn")
@@ -52,6 +62,32 @@ def units(plan: Plan, out: Path | None, work: Sequence[Work], workers: int) -> I
             raise UserError("a worker process was ended from outside, perhaps for want of memory; run again to go on") from None
         finally:
             executor.shutdown(wait=False, cancel_futures=True)
+
+
+def needs_map(plan: Plan) -> bool:
+    """Whether some cell of the plan will ask for the place's map."""
+    return plan.task.places or any(cell.attack is not None and Knowledge.MAP in cell.attack.needs for cell in plan.cells)
+
+
+def extracted(extractor: Extractor, images: Sequence[Pixels]) -> Iterator[Features]:
+    """The features of images, by as many processes as there are cores where many are not kept yet.
+
+    Raises
+    ------
+    UnitError
+        if one of them cannot be read.
+    """
+    from bench.features import kept
+
+    missing = [image for image in images if not kept.is_kept(extractor, image)]
+    if len(missing) > FEW:
+        with (
+            ProcessPoolExecutor(os.cpu_count(), multiprocessing.get_context("spawn")) as executor,
+            Progress("features of reference images", len(missing)) as progress,
+        ):
+            for _ in executor.map(kept.keep, itertools.repeat(extractor), missing):
+                progress.advance()
+    return (kept.features(extractor, image) for image in images)
 
 
 _plan: Plan | None = None  # of this process, if it is a worker

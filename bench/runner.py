@@ -21,13 +21,27 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from bench import composition, environment, pool, records, registry, spec, units
+from bench import composition, environment, fields, pool, records, registry, spec, units
 from bench.datasets.photographs import Source
 from bench.errors import PluginError, UnitError, UserError, blamed
 from bench.features import kept
 from bench.features.sift import Sift
 from bench.place import Place
-from bench.plugin import Attack, Dataset, Defense, Extractor, Metric, Outcome, Privacy, Shot, Task, Trial
+from bench.plugin import (
+    Attack,
+    CarryOut,
+    Dataset,
+    Defense,
+    Extractor,
+    Metric,
+    Outcome,
+    Plugin,
+    Privacy,
+    Shot,
+    Task,
+    Trial,
+    at_once,
+)
 from bench.population import Population
 from bench.public import Public
 from bench.records import EVERY_UNIT, Record
@@ -60,6 +74,7 @@ class Asked:
     extractor: Extractor
     dataset: Dataset | None
     seed: int
+    metrics: tuple[Metric, ...] = ()  # beside those that need nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +90,7 @@ class Plan:
     metrics: tuple[Metric, ...]
     public: Public
     seed: int
+    carry_out: CarryOut = at_once  # where attacks are carried out
 
     @property
     def hash(self) -> str:
@@ -95,6 +111,7 @@ def run(
     task: Task | None = None,
     dataset: Dataset | None = None,
     seed: int = 0,
+    metrics: Sequence[Metric] = (),
     out: Path | str | None = None,
 ) -> list[Record]:
     """Run every defense against every attack, and return one record for each unit, such as a photograph, of each pair.
@@ -107,6 +124,7 @@ def run(
     task : `Reconstruction()` if None
     dataset : the place that it is about, for a task that is about one
     seed : of everything random. A release whose seed is known is for measuring and protects nobody.
+    metrics : those that must be told something, such as a file, beside all that need not be
     out : a folder to keep records and reconstructions in; what it holds already is not done again
 
     Raises
@@ -114,7 +132,7 @@ def run(
     UserError
         if something is wrong with what was asked; nothing has been written then.
     """
-    plan = prepare(defenses, attacks, images, extractor=extractor, task=task, dataset=dataset, seed=seed)
+    plan = prepare(defenses, attacks, images, extractor=extractor, task=task, dataset=dataset, seed=seed, metrics=metrics)
     return list(execute(plan, None if out is None else Path(out)))
 
 
@@ -127,6 +145,7 @@ def prepare(
     task: Task | None = None,
     dataset: Dataset | None = None,
     seed: int = 0,
+    metrics: Sequence[Metric] = (),
 ) -> Plan:
     """Check what was asked, and lay out what is to be done. Parameters as those of `run`.
 
@@ -144,7 +163,7 @@ def prepare(
         raise UserError(f"{task.name()} judges the release itself and takes no attack")
     tried: Sequence[Attack | None] = attacks or [None]
     pairs = [(defense, attack) for defense in defenses for attack in tried]
-    return prepare_pairs(pairs, images, extractor=extractor, task=task, dataset=dataset, seed=seed)
+    return prepare_pairs(pairs, images, extractor=extractor, task=task, dataset=dataset, seed=seed, metrics=metrics)
 
 
 def prepare_pairs(
@@ -155,6 +174,7 @@ def prepare_pairs(
     extractor: Extractor | None = None,
     dataset: Dataset | None = None,
     seed: int = 0,
+    metrics: Sequence[Metric] = (),
 ) -> Plan:
     """As `prepare`, for these pairs of a defense and an attack instead of all; None where the task judges the release itself.
 
@@ -163,8 +183,18 @@ def prepare_pairs(
     UserError
         as `prepare`.
     """
-    asked = Asked(pairs=tuple(pairs), images=images, task=task, extractor=extractor or Sift(), dataset=dataset, seed=seed)
+    asked = Asked(
+        pairs=tuple(pairs),
+        images=images,
+        task=task,
+        extractor=extractor or Sift(),
+        dataset=dataset,
+        seed=seed,
+        metrics=tuple(metrics),
+    )
     plan = planned(asked)
+    if all(cell.reason for cell in plan.cells):
+        raise UserError("nothing to run: " + "; ".join(sorted({str(cell.reason) for cell in plan.cells})))
     _rehearse(plan)
     return plan
 
@@ -175,7 +205,7 @@ def planned(asked: Asked) -> Plan:
     Raises
     ------
     UserError
-        if something is wrong with what was asked, or no pair of it applies.
+        if something is wrong with what was asked.
     """
     task, extractor, dataset, seed = asked.task, asked.extractor, asked.dataset, asked.seed
     collection = task.collection(asked.images, dataset)
@@ -187,7 +217,7 @@ def planned(asked: Asked) -> Plan:
         "hash": units.digest(hashes | dict(collection.beside)),
         "extractor": spec.configuration(extractor, public),
     }
-    metrics = tuple(metric() for metric in registry.everything(registry.METRIC)) if task.attacked else ()
+    metrics = (*_metrics(), *asked.metrics) if task.attacked else ()
     settings = {metric.name(): _settings(metric) for metric in metrics}
     taking_part = [plugin for pair in asked.pairs for plugin in pair if plugin is not None]
     ran = environment.describe([task, extractor, *taking_part, *metrics])
@@ -206,14 +236,14 @@ def planned(asked: Asked) -> Plan:
             "defense": protected,
             "attack": _attack_configuration(task, defense, attack, extractor, public, reason),
             "dataset": judged,
+            "task_settings": _settings(task),
             "metric_settings": settings,
             "seed": seed,
+            "sources": {"defense": environment.file_digest(defense), "attack": attack and environment.file_digest(attack)},
         }
         cell_id = records.cell_id(spec.written(task), head["defense"], head["attack"], judged, seed, settings)
         head |= {"cell_id": cell_id, "run_hash": records.run_hash(cell_id, ran), "environment": ran}
         cells.append(Cell(defense, attack, defense.privacy(public), populations[defense], head, reason))
-    if all(cell.reason for cell in cells):
-        raise UserError("nothing to run: " + "; ".join(sorted({str(cell.reason) for cell in cells})))
     unique = {cell.head["cell_id"]: cell for cell in cells}  # one that was asked for twice is done once
     return Plan(asked, task, tuple(unique.values()), collection.units, hashes, extractor, metrics, public, seed)
 
@@ -258,10 +288,17 @@ def randomness(*parts: Any) -> np.random.Generator:
     return np.random.default_rng(int(hashlib.sha256(records.canonical(parts).encode()).hexdigest(), 16))
 
 
-def _settings(metric: Metric) -> dict[str, Any]:
-    fields = spec.written(metric)
-    del fields["name"]
-    return fields | dict(metric.parameters)
+def _metrics() -> Iterator[Metric]:
+    """All that need not be told anything."""
+    for metric in registry.everything(registry.METRIC):
+        if not fields.without_default(metric):
+            yield metric()
+
+
+def _settings(plugin: Plugin) -> dict[str, Any]:
+    settings = spec.written(plugin)
+    del settings["name"]
+    return settings | (dict(plugin.parameters) if isinstance(plugin, Metric) else {})
 
 
 def _attack_configuration(
@@ -385,11 +422,23 @@ def _protect(plan: Plan, cell: Cell, features: Features, content: str, *repetiti
     return release
 
 
-def _judged(plan: Plan, cell: Cell, unit: Unit, shots: tuple[Shot, ...], notes: Sequence[str], out: Path | None) -> Record:
+def trial(plan: Plan, cell: Cell, unit: Unit) -> Trial:
+    """A unit of a cell, extracted and protected as `execute` does it, before it is judged.
+
+    Raises
+    ------
+    UnitError
+        if it cannot be read, has no keypoint, or a plugin breaks.
+    """
+    shots = tuple(_shot(plan, cell, unit, number, _observed(plan, image)) for number, image in enumerate(unit.images))
+    return _trial(plan, cell, unit, shots)
+
+
+def _trial(plan: Plan, cell: Cell, unit: Unit, shots: tuple[Shot, ...]) -> Trial:
     head = cell.head
     content = plan.hashes[unit.name]
     first = shots[0].secret
-    trial = Trial(
+    return Trial(
         unit=unit,
         shots=shots,
         defense=cell.defense,
@@ -400,10 +449,15 @@ def _judged(plan: Plan, cell: Cell, unit: Unit, shots: tuple[Shot, ...], notes: 
         rng=randomness("attack", plan.seed, content, head["defense"], head["dataset"]["extractor"], head["attack"]),
         others=cell.population.without(unit.name),
         repeats=tuple(_protect(plan, cell, first, content, number) for number in _repetitions(cell.attack)),
+        carry_out=plan.carry_out,
     )
+
+
+def _judged(plan: Plan, cell: Cell, unit: Unit, shots: tuple[Shot, ...], notes: Sequence[str], out: Path | None) -> Record:
+    tried = _trial(plan, cell, unit, shots)
     started = time.perf_counter()
     with blamed(f"task {plan.task.name()}"):
-        outcome = plan.task.judge(trial)
+        outcome = plan.task.judge(tried)
     keypoints = max(len(shot.secret) for shot in shots)
     record = _record(cell, unit, status="ok", outcome=outcome, keypoints=keypoints, notes=notes)
     record["seconds"] = time.perf_counter() - started
@@ -442,13 +496,13 @@ def _record(
         "status": status,
         "reason": reason,
         "metrics": {} if outcome is None else {**outcome.metrics, "keypoints": keypoints},
-        "privacy": _privacy(cell, keypoints),
+        "privacy": privacy(cell, keypoints),
         "seconds": None,
         "notes": [*notes, *(outcome.notes if outcome else ())],
     }
 
 
-def _privacy(cell: Cell, keypoints: int | None) -> dict[str, Any]:
+def privacy(cell: Cell, keypoints: int | None) -> dict[str, Any]:
     """What the defense promises of what is released of one image, and what nothing covers."""
     epsilon, remembers = cell.privacy.epsilon, cell.defense.remembers()
     # A device that remembers answers once, however often it is asked.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from typing import Any
 
 import numpy as np
 
@@ -28,14 +29,27 @@ def features(extractor: Extractor, pixels: Pixels) -> Features:
         found = extractor.extract(pixels.read(), getattr(pixels, "path", None))
         return to_arrays(found), {"size": list(found.size)}
 
-    key = {
+    arrays, meta = cache.fetch(KIND, _key(extractor, pixels), make)
+    return from_arrays(arrays, tuple(meta["size"]))
+
+
+def keep(extractor: Extractor, pixels: Pixels) -> None:
+    """As `features`, for a process that keeps them for others."""
+    features(extractor, pixels)
+
+
+def is_kept(extractor: Extractor, pixels: Pixels) -> bool:
+    """Whether the features are on disk."""
+    return cache.path(KIND, _key(extractor, pixels)).is_file()
+
+
+def _key(extractor: Extractor, pixels: Pixels) -> dict[str, Any]:
+    return {
         "image": pixels.content_hash(),
         "extractor": spec.written(extractor),
         "source": cache.source(sys.modules[type(extractor).__module__]),
         "libraries": environment.libraries(),
     }
-    arrays, meta = cache.fetch(KIND, key, make)
-    return from_arrays(arrays, tuple(meta["size"]))
 
 
 def to_arrays(found: Features) -> Arrays:

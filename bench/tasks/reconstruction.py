@@ -82,7 +82,7 @@ class Reconstruction(Task):
         if attack is None:
             raise UnitError("reconstruction needs an attack")
         if isinstance(attack, ImageAttack):
-            return compared(trial, None, reconstructed(attack, view(trial), trial.rng))
+            return compared(trial, None, reconstructed(attack, view(trial), trial))
         found, told = recovered(attack, trial)
         inverter, undefended, reason = self._inverter(trial.extractor, trial.public)
         if reason is not None:
@@ -90,7 +90,7 @@ class Reconstruction(Task):
         keypoints = trial.release.keypoints[found.rows]
         release = Descriptors(keypoints=keypoints, size=trial.release.size, descriptors=found.descriptors)
         seen = view(dataclasses.replace(trial.released(release), attack=inverter, defense=undefended))
-        return compared(trial, found, reconstructed(inverter, seen, trial.rng), told)
+        return compared(trial, found, reconstructed(inverter, seen, trial), told)
 
     def _inverter(self, extractor: Extractor, public: Public) -> tuple[ImageAttack, Defense, str | None]:
         """The attack that paints descriptors, the defense that it was made for, and why it cannot be used, if it cannot."""
@@ -139,10 +139,10 @@ def _served(trial: Trial) -> Any:
     return Server(public=trial.public, camera=trial.unit.subject.camera)
 
 
-def reconstructed(attack: ImageAttack, seen: View, rng: np.random.Generator) -> Floats:
+def reconstructed(attack: ImageAttack, seen: View, trial: Trial) -> Floats:
     """The attacker's image. -> (H, W, 3)"""
     with blamed(f"plugin {attack.name()}"):
-        image = attack.reconstruct(seen, rng)
+        image: Floats = trial.carry_out(attack.reconstruct, seen, trial.rng)
         width, height = seen.release.size
         _expect(image, (height, width, 3))
         if image.min() < 0 or image.max() > 1:
@@ -155,11 +155,12 @@ def recovered(attack: Attack, trial: Trial) -> tuple[Selection, tuple[str, ...]]
     seen, everything = view(trial), trial.secret.descriptors
     with blamed(f"plugin {attack.name()}"):
         if isinstance(attack, SelectiveAttack):
-            found = attack.select(seen, trial.rng)
+            found = trial.carry_out(attack.select, seen, trial.rng)
             _expect(found.descriptors, everything[found.rows].shape)
         elif isinstance(attack, DescriptorAttack):
-            found = Selection(rows=np.arange(len(everything)), descriptors=attack.recover(seen, trial.rng))
-            _expect(found.descriptors, everything.shape)
+            descriptors = trial.carry_out(attack.recover, seen, trial.rng)
+            _expect(descriptors, everything.shape)
+            found = Selection(rows=np.arange(len(everything)), descriptors=descriptors)
         else:
             raise TypeError(f"{attack.name()} recovers neither descriptors nor images")
     return found, tuple(map(str, seen.notes))

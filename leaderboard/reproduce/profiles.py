@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -27,6 +28,11 @@ class Profile:
     # Fields of attacks that are set for want of time, where an attack has them; otherwise attacks are as they were tuned.
     reduced: Mapping[str, int] = field(default_factory=dict)
 
+    @property
+    def pictured(self) -> Gallery:
+        """The place with as few queries as figures show."""
+        return dataclasses.replace(self.place, queries=self.pictures, night=0.0)
+
 
 # Of the built-in photographs `rocket` has the fewest keypoints.
 SMOKE = Profile(
@@ -51,7 +57,7 @@ CPU = Profile(
     subspaces=20_000,
     others=1600,
     place=Gallery(),
-    place_scale=1 / 16,
+    place_scale=1 / 32,
     trials=0.003,
 )
 PAPER = Profile(

@@ -1,0 +1,86 @@
+"""Speed, as ratios of times within one run of pytest-benchmark, against ratios that were found good.
+
+A time means little on another machine, and so does a ratio of two machines' times. A group of benchmarks holds floors, such as a
+bare product of matrices or another library's search, and the others are divided by the quickest of them, which is another one on
+another processor. pytest-benchmark compares times with those of earlier runs (`--benchmark-compare`), and knows no ratios within
+a run.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from bench.errors import UserError
+from leaderboard.regression import Finding, Verdict
+
+TOLERANCE = 2.0  # times as much as the baseline: what a busy machine makes of it is less
+FLOORS = ("bare_product", "random words", "faiss")  # in the names of benchmarks that others are divided by
+
+Ratios = Mapping[str, float]
+
+
+def read(path: Path) -> Ratios:
+    """The committed ratios, by benchmark.
+
+    Raises
+    ------
+    UserError
+        if the file is missing, or holds something else.
+    """
+    found = _json(path)
+    if not isinstance(found, dict) or not all(isinstance(value, (int, float)) for value in found.values()):
+        raise UserError(f"{path}: expected ratios, a number for each benchmark's name")
+    return found
+
+
+def ratios(path: Path) -> Ratios:
+    """Shortest time of each benchmark, divided by that of its group's quickest floor, from what `--benchmark-json` wrote.
+
+    Raises
+    ------
+    UserError
+        if the file is missing, or holds something else.
+    """
+    found = _json(path)
+    if not isinstance(found, dict) or "benchmarks" not in found:
+        raise UserError(f"{path}: not what pytest --benchmark-json wrote")
+    groups: dict[str, dict[str, float]] = {}
+    for one in found["benchmarks"]:
+        groups.setdefault(str(one["group"]), {})[one["name"]] = one["stats"]["min"]
+    measured: dict[str, float] = {}
+    for group, times in groups.items():
+        floors = [time for name, time in times.items() if _is_floor(name)]
+        if floors:
+            measured |= {f"{group}: {name}": time / min(floors) for name, time in times.items() if not _is_floor(name)}
+    return measured
+
+
+def compare(baseline: Ratios, measured: Ratios) -> list[Finding]:
+    """A finding for each benchmark of either side."""
+    return [_finding(name, baseline.get(name), measured.get(name)) for name in sorted({*baseline, *measured})]
+
+
+def _finding(name: str, before: float | None, after: float | None) -> Finding:
+    finding = functools.partial(Finding, defense=name, attack="its floor")
+    if before is None or after is None:
+        return finding(verdict="new" if before is None else "missing")
+    verdict: Verdict = "worse" if after > before * TOLERANCE else "better" if after < before / TOLERANCE else "same"
+    allowed = before * (TOLERANCE - 1)
+    return finding(verdict=verdict, metric="time", before=before, after=after, tolerance=allowed)
+
+
+def _is_floor(name: str) -> bool:
+    return any(part in name for part in FLOORS)
+
+
+def _json(path: Path) -> Any:
+    if not path.is_file():
+        raise UserError(f"{path}: no such file")
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise UserError(f"{path}: no JSON ({error})") from error
