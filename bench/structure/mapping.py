@@ -1,6 +1,8 @@
-"""Structure from motion by COLMAP: verified pairs go through `pycolmap.Database` to incremental mapping.
+"""Structure from motion by COLMAP: verified pairs go through `pycolmap.Database` to its mapping, incremental or global.
 
-Intrinsics are known, shared and fixed. One thread and a seed, so that the same matches make the same model.
+Incremental mapping (Schönberger and Frahm, CVPR 2016) begins with the points of two images and adds an image that sees enough
+of them; of a private release another image shows few. Global mapping (Pan et al., ECCV 2024) takes the poses from the geometry
+of all pairs at once. Intrinsics are known, shared and fixed. One thread and a seed, so that the same matches make the same model.
 """
 
 from __future__ import annotations
@@ -9,6 +11,7 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pycolmap
@@ -18,9 +21,9 @@ from bench.structure.consistency import Doubles
 from bench.structure.verification import Geometry, Pair
 from bench.types import Floats
 
-# COLMAP asks for 100 matches to begin with and for 30 to add an image; a private release has fewer.
-FIRST_MATCHES = 40
-MATCHES = 15
+Mapper = Literal["incremental", "global"]
+
+MATCHES = 15  # that add an image to an incremental model; COLMAP asks for 30, and a private release has fewer
 SMALLEST = 3  # images of a model
 
 
@@ -45,8 +48,10 @@ class Model:
         return np.array([pose.inverse().translation for pose in self.poses]).reshape(-1, 3)
 
 
-def mapped(camera: pycolmap.Camera, keypoints: Sequence[Floats], geometries: Mapping[Pair, Geometry], seed: int) -> Model | None:
-    """The model with most images, and of those with most points; None if there is none.
+def mapped(
+    camera: pycolmap.Camera, keypoints: Sequence[Floats], geometries: Mapping[Pair, Geometry], mapper: Mapper, seed: int
+) -> Model | None:
+    """The model with most images, and of those with most points; None if there is none of `SMALLEST` images.
 
     Parameters
     ----------
@@ -56,27 +61,39 @@ def mapped(camera: pycolmap.Camera, keypoints: Sequence[Floats], geometries: Map
     with tempfile.TemporaryDirectory() as scratch, quietly():
         database = Path(scratch) / "database.db"
         _write(database, camera, keypoints, geometries)
-        options = pycolmap.IncrementalPipelineOptions(
-            random_seed=seed,
-            num_threads=1,
-            min_num_matches=MATCHES,
-            min_model_size=SMALLEST,
-            extract_colors=False,
-            ba_refine_focal_length=False,
-            ba_refine_principal_point=False,
-            ba_refine_extra_params=False,
-        )
-        options.mapper.num_threads = 1
-        options.mapper.init_min_num_inliers = FIRST_MATCHES
-        options.mapper.abs_pose_min_num_inliers = MATCHES
-        options.mapper.abs_pose_refine_focal_length = False
-        options.mapper.abs_pose_refine_extra_params = False
-        models = pycolmap.incremental_mapping(database, scratch, scratch, options)
+        if mapper == "incremental":
+            models = pycolmap.incremental_mapping(database, scratch, scratch, _incremental(seed))
+        else:
+            models = pycolmap.global_mapping(database, scratch, scratch, _global(seed))
     if not models:
         return None
     best = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()))
-    best.update_point_3d_errors()
-    return _summary(best)
+    return _summary(best) if best.num_reg_images() >= SMALLEST else None
+
+
+def _incremental(seed: int) -> pycolmap.IncrementalPipelineOptions:
+    options = pycolmap.IncrementalPipelineOptions(
+        random_seed=seed,
+        num_threads=1,
+        min_model_size=SMALLEST,
+        extract_colors=False,
+        ba_refine_focal_length=False,
+        ba_refine_principal_point=False,
+        ba_refine_extra_params=False,
+    )
+    options.mapper.num_threads = 1
+    options.mapper.abs_pose_min_num_inliers = MATCHES
+    options.mapper.abs_pose_refine_focal_length = False
+    options.mapper.abs_pose_refine_extra_params = False
+    return options
+
+
+def _global(seed: int) -> pycolmap.GlobalPipelineOptions:
+    options = pycolmap.GlobalPipelineOptions(random_seed=seed, num_threads=1, min_model_size=SMALLEST)
+    adjustment = options.mapper.bundle_adjustment
+    adjustment.refine_focal_length = adjustment.refine_principal_point = adjustment.refine_extra_params = False
+    adjustment.ceres.use_gpu = options.mapper.global_positioning.use_gpu = False  # sums in another order each time
+    return options
 
 
 def _write(database: Path, camera: pycolmap.Camera, keypoints: Sequence[Floats], geometries: Mapping[Pair, Geometry]) -> None:
@@ -104,6 +121,7 @@ def _write(database: Path, camera: pycolmap.Camera, keypoints: Sequence[Floats],
 
 
 def _summary(model: pycolmap.Reconstruction) -> Model:
+    model.update_point_3d_errors()
     numbers = sorted(model.reg_image_ids())
     return Model(
         images=tuple(number - 1 for number in numbers),
