@@ -23,7 +23,7 @@ from bench.types import Floats
 
 Mapper = Literal["incremental", "global"]
 
-MATCHES = 15  # that add an image to an incremental model; COLMAP asks for 30, and a private release has fewer
+MATCHES = 15  # with points that an image of a model has; COLMAP asks for 30 to add one, and a private release has fewer
 SMALLEST = 3  # images of a model
 
 
@@ -53,6 +53,8 @@ def mapped(
 ) -> Model | None:
     """The model with most images, and of those with most points; None if there is none of `SMALLEST` images.
 
+    Global mapping places whatever a chain of pairs leads to. An image that sees fewer than `MATCHES` points is left out.
+
     Parameters
     ----------
     camera : of all images
@@ -65,10 +67,9 @@ def mapped(
             models = pycolmap.incremental_mapping(database, scratch, scratch, _incremental(seed))
         else:
             models = pycolmap.global_mapping(database, scratch, scratch, _global(seed))
-    if not models:
-        return None
-    best = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()))
-    return _summary(best) if best.num_reg_images() >= SMALLEST else None
+    found = [_summary(model) for model in models.values()]
+    best = max(found, key=lambda model: (len(model.images), len(model.points)), default=None)
+    return None if best is None or len(best.images) < SMALLEST else best
 
 
 def _incremental(seed: int) -> pycolmap.IncrementalPipelineOptions:
@@ -122,10 +123,10 @@ def _write(database: Path, camera: pycolmap.Camera, keypoints: Sequence[Floats],
 
 def _summary(model: pycolmap.Reconstruction) -> Model:
     model.update_point_3d_errors()
-    numbers = sorted(model.reg_image_ids())
+    numbers = [number for number in sorted(model.reg_image_ids()) if model.image(number).num_points3D >= MATCHES]
     return Model(
         images=tuple(number - 1 for number in numbers),
-        poses=tuple(model.image(number).cam_from_world() for number in numbers),
+        poses=tuple(pycolmap.Rigid3d(model.image(number).cam_from_world().matrix()) for number in numbers),  # copies
         points=np.array([model.points3D[point].xyz for point in sorted(model.points3D)]).reshape(-1, 3),
         observations=model.compute_num_observations(),
         reprojection_error=float(model.compute_mean_reprojection_error()),

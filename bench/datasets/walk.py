@@ -1,0 +1,61 @@
+"""A stretch of a walk through the gallery's courtyard: views close to each other, as one takes them for structure from motion.
+
+The queries are consecutive views of the second lap, which looks across the courtyard, without people. The references, which a
+dictionary is made from, are views of both laps all around it, the stretch left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bench.datasets.gallery import Gallery
+from bench.datasets.scene import Scene
+from bench.errors import UserError
+from bench.plugin import Dataset
+
+
+@dataclass(frozen=True, kw_only=True)
+class Walk(Dataset):
+    """Consecutive views of a walk through a made-up courtyard, rendered here; poses are exact and in metres."""
+
+    seed: int = 0
+    views: int = 25  # of the stretch
+    others: int = 150  # views of the courtyard that are not of the stretch
+    start: float = 0.3  # of the stretch, as a share of the lap
+    steps: int = 340  # views of a lap: the more, the closer
+    width: int = 640  # pixels
+    height: int = 480
+    detail: float = 1.0  # of textures and light; 1 is about a texel a pixel from 1.5 m away
+
+    def __post_init__(self) -> None:
+        if self.views < 2 or self.others < 1:
+            raise UserError("walk: at least two views, and one other")
+        if not 0 <= self.start <= 1 or self.views + self.others > self.steps:
+            raise UserError("walk: start is from 0 to 1, and a lap has at least as many steps as there are views and others")
+
+    def scene(self) -> Scene:
+        gallery = Gallery(
+            seed=self.seed,
+            views=2 * self.steps,
+            queries=0,
+            rooms=1,
+            people=0.0,
+            width=self.width,
+            height=self.height,
+            detail=self.detail,
+        )
+        taken = gallery.scene().references  # a lap after the other
+        first = self.steps + round(self.start * (self.steps - self.views))
+        stretch = range(first, first + self.views)
+        rest = [index for index in range(len(taken)) if index not in stretch]
+        others = [rest[place] for place in np.linspace(0, len(rest) - 1, self.others).round().astype(int)]
+        return Scene(
+            name="walk",
+            references=tuple(taken[index] for index in others),
+            queries=tuple(replace(taken[index]) for index in stretch),
+        )
+
+
+PLUGIN = Walk

@@ -1,0 +1,132 @@
+"""Structure from motion: the model that a server makes of a place from nothing but releases (the paper's supplement, Table S2).
+
+All images are privatised. Two keypoints match by a word that both images release and that is unique in each, by mutually
+nearest descriptors, or by mutually nearest subspaces. Pairs of images are verified and mapped as `bench/structure/` says.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import pycolmap
+
+from bench import matching, units
+from bench.datasets.scene import SceneImage
+from bench.datasets.walk import Walk
+from bench.errors import UnitError, UserError
+from bench.plugin import Attack, Dataset, Defense, Extractor, Outcome, Task, Trial
+from bench.public import Public
+from bench.structure import agreement, mapping, picture, verification
+from bench.structure.mapping import Mapper, Model
+from bench.types import Descriptors, Release, Subspaces, WordSets
+from bench.units import Collection, Images, Unit
+
+
+@dataclass(frozen=True, kw_only=True)
+class Structure(Task):
+    """How much of a place structure from motion rebuilds from releases: of its queries, as their poses are sought.
+
+    The references, if there are any, serve for the dictionary alone.
+    """
+
+    attacked: ClassVar[bool] = False
+    places: ClassVar[bool] = True
+
+    images: int = 25  # the first queries of the place, at most
+    ratio: float = 0.8  # of Lowe's test among descriptors; 1 asks for nothing
+    mapper: Mapper = "global"
+
+    def __post_init__(self) -> None:
+        if self.images < mapping.SMALLEST:
+            raise UserError(f"structure: images must be at least {mapping.SMALLEST}, got {self.images}")
+        if not 0 < self.ratio <= 1:
+            raise UserError(f"structure: ratio must be above 0 and at most 1, got {self.ratio}")
+        if self.mapper not in ("incremental", "global"):
+            raise UserError(f"structure: mapper must be incremental or global, got {self.mapper}")
+
+    def collection(self, images: Images, dataset: Dataset | None) -> Collection:
+        if images is not None:
+            raise UserError(
+                "structure is about a place and takes no images; give --dataset, such as captured:path=DIR,held_out=2"
+            )
+        scene = (dataset or Walk()).scene()
+        chosen = scene.queries[: self.images]
+        if len(chosen) < mapping.SMALLEST:
+            raise UserError(f"{scene.name}: {len(chosen)} queries, of which nothing can be rebuilt")
+        for image in chosen:
+            if _intrinsics(image.camera) != _intrinsics(chosen[0].camera):
+                raise UserError(f"{scene.name}: {chosen[0].name} and {image.name} are of different cameras; structure takes one")
+        unit = Unit(name=scene.name, images=tuple(image.pixels for image in chosen), subject=chosen)
+        return Collection(name=scene.name, units=(unit,), scene=scene, beside={"scene": units.fingerprint(chosen)})
+
+    def inapplicable(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> str | None:
+        if issubclass(defense.releases, (Descriptors, Subspaces, WordSets)):
+            return None
+        return f"nothing matches {defense.releases.__name__}"
+
+    def resolved(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> Mapping[str, Any]:
+        return {}
+
+    def judge(self, trial: Trial) -> Outcome:
+        images: tuple[SceneImage, ...] = trial.unit.subject
+        releases = [shot.release for shot in trial.shots]
+        keypoints = [release.keypoints for release in releases]
+        camera, seed = images[0].camera, int(trial.rng.integers(2**31))
+        found = {(a, b): self._matches(releases[a], releases[b]) for a, b in itertools.combinations(range(len(releases)), 2)}
+        geometries = verification.verified(camera, keypoints, found, seed)
+        model = mapping.mapped(camera, keypoints, geometries, self.mapper, seed)
+        told = {
+            "images": float(len(images)),
+            "tried_matches": float(np.mean([len(pairs) for pairs in found.values()])),
+            "verified_pairs": float(len(geometries)),
+            "verified_matches": float(sum(len(geometry.matches) for geometry in geometries.values())),
+        }
+        return Outcome(
+            metrics={**measured(model, [image.cam_from_world for image in images]), **told},
+            image=None if model is None else picture.from_above(model),
+        )
+
+    def _matches(self, first: Release, second: Release) -> np.ndarray:
+        try:
+            # Subspaces are as far from their second nearest as from their nearest, nearly: the ratio would tell nothing.
+            ratio = 1.0 if isinstance(first, Subspaces) else self.ratio
+            return matching.matches(first, second, ratio, unique=True)
+        except TypeError as error:
+            raise UnitError(str(error)) from None
+
+
+def measured(model: Model | None, truth: Sequence[pycolmap.Rigid3d | None]) -> dict[str, float | None]:
+    """The paper's four measures, and how many images are where they were taken; None where poses are withheld.
+
+    Parameters
+    ----------
+    model : None if there is none
+    truth : cam_from_world of every image
+    """
+    known = [pose for pose in truth if pose is not None]
+    if model is None:
+        return {
+            "registered": 0.0,
+            "points": 0.0,
+            "track_length": None,
+            "reprojection_error": None,
+            "right_poses": 0.0 if len(known) == len(truth) else None,
+        }
+    return {
+        "registered": float(len(model.images)),
+        "points": float(len(model.points)),
+        "track_length": model.track_length,
+        "reprojection_error": model.reprojection_error,
+        "right_poses": float(agreement.right(model, known)) if len(known) == len(truth) else None,
+    }
+
+
+def _intrinsics(camera: pycolmap.Camera) -> tuple[Any, ...]:
+    return camera.model, camera.width, camera.height, tuple(camera.params)
+
+
+PLUGIN = Structure
