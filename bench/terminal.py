@@ -70,3 +70,10 @@ def add_seed(parser: argparse.ArgumentParser, what: str = "everything random") -
 def add_extractor(parser: argparse.ArgumentParser) -> None:
     """Declare --extractor."""
     parser.add_argument("--extractor", metavar="SPEC", default="sift", help="what makes the features (default: %(default)s)")
+
+
+def add_engine(parser: argparse.ArgumentParser) -> None:
+    """Declare --workers, --engine and --scheduler."""
+    parser.add_argument("--workers", type=whole, default=1, metavar="N", help="processes of this machine (default: %(default)s)")
+    parser.add_argument("--engine", metavar="NAME", default="processes", help="processes or dask (default: %(default)s)")
+    parser.add_argument("--scheduler", metavar="ADDRESS", help="of dask, such as tcp://127.0.0.1:8786 (docs/sweeps.md)")

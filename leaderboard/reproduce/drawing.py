@@ -14,7 +14,7 @@ from PIL import Image
 from bench.datasets import photographs
 from bench.datasets.photographs import Source
 from bench.errors import UnitError
-from bench.runner import picture
+from bench.rundir import picture
 from bench.types import Bytes
 from leaderboard.figures import Panel
 from leaderboard.reproduce.profiles import Setting

@@ -86,15 +86,17 @@ def execute(rows: Sequence[Row], setting: Setting, sources: Sequence[Source], ou
     """Run the rows on the photographs, one plan for each task; records that `out` holds are not made again."""
     plans = [_plan(task, rows, setting, sources) for task in dict.fromkeys(row.task for row in rows)]
     cells = {row.name: _cell(row, plans) for row in rows}
-    records: dict[str, list[Record]] = {}
+    found: list[Record] = []
     with Progress(f"{title}: {len(sources)} photographs, {len(rows)} rows", sum(map(len, plans))) as progress:
-        while plans:  # a plan that is done lets go of the releases that it made
-            for record in runner.execute(plans.pop(0), out):
-                records.setdefault(record["cell_id"], []).append(record)
-                progress.advance(note=record["unit"])
-                if record["status"] == "failed":
-                    progress.say(f"bench: failed: {record['unit']}, {record['defense']['name']}: {record['reason']}")
-    return Ran(rows=tuple(rows), cells=cells, records={cell: tuple(found) for cell, found in records.items()})
+        for record in runner.execute(plans, out):
+            found.append(record)
+            progress.advance(note=record["unit"])
+            if record["status"] == "failed":
+                progress.say(f"bench: failed: {record['unit']}, {record['defense']['name']}: {record['reason']}")
+    records: dict[str, list[Record]] = {}
+    for record in runner.in_order(plans, found):
+        records.setdefault(record["cell_id"], []).append(record)
+    return Ran(rows=tuple(rows), cells=cells, records={cell: tuple(its) for cell, its in records.items()})
 
 
 def weigh(table: Table, setting: Setting, chosen: Photographs, ran: Ran) -> Rebuilt:
