@@ -19,14 +19,17 @@ LIBRARIES = ("numpy", "opencv-python-headless", "pillow", "pycolmap", "scikit-im
 
 def describe(plugins: Iterable[object]) -> dict[str, Any]:
     """The environment as records hold it. `plugins` are those that take part; their files count as source."""
+    return {"version": version(DISTRIBUTION), "source": source_digest(plugins), **computing()}
+
+
+def computing() -> dict[str, Any]:
+    """All of the environment that numbers may depend on beside our own source."""
     import torch
 
     from bench.device import pick_device, pick_dtype
 
     device = pick_device()
     return {
-        "version": version(DISTRIBUTION),
-        "source": source_digest(plugins),
         "python": platform.python_version(),
         **libraries(),
         "machine": f"{platform.system()} {platform.machine()}",

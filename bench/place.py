@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from bench import cache, spec, units
+from bench import cache, provenance, spec, units
 from bench.datasets.scene import Scene, SceneImage
 from bench.errors import UserError
 from bench.features import build, dictionary, kept
@@ -30,7 +30,7 @@ class Place:
     def digest(self) -> str:
         """Of what the dictionary is made from and how, but for the number of its words."""
         hashes = [image.pixels.content_hash() for image in self.scene.references]
-        return units.digest(["references", hashes, spec.written(self.extractor), SEED, cache.source(build)])
+        return units.digest(["references", hashes, spec.written(self.extractor), SEED, provenance.source(build.__name__)])
 
     def features(self, image: SceneImage) -> Features:
         """Of a reference or a query."""

@@ -294,6 +294,7 @@ class Trial:
     rng: np.random.Generator
     others: Callable[[int], Iterator[Release]]  # the first so many releases of other photographs
     repeats: tuple[Release, ...]  # further releases of the first image's features
+    made_from: Mapping[str, Any] | None = None  # JSON: all that the releases are a function of; None keeps nothing of the trial
 
     @property
     def secret(self) -> Features:
@@ -321,6 +322,7 @@ class Outcome:
     metrics: Mapping[str, float | None]
     image: Floats | None = None  # (H, W, 3) in [0, 1], where one was made
     notes: tuple[str, ...] = ()
+    spared: float = 0.0  # seconds that it would have taken longer, had nothing been kept
 
 
 class Task(Plugin, ABC):

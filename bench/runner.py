@@ -14,6 +14,7 @@ from typing import Any
 from bench import engines, environment, records, registry, rundir, spec, trials, units
 from bench.engines import Engine, Job
 from bench.errors import UserError
+from bench.features import kept
 from bench.features.sift import Sift
 from bench.place import Place
 from bench.plugin import Attack, Dataset, Defense, Extractor, Metric, Privacy, Task
@@ -74,8 +75,12 @@ class Plan:
 
     def record_keys(self) -> Iterator[tuple[str, str]]:
         """What its records are known by, `run_hash` and unit, in order."""
-        yield from ((cell.head["run_hash"], EVERY_UNIT) for cell in self.cells if cell.reason is not None)
-        yield from ((cell.head["run_hash"], unit.name) for unit in self.units for cell in self.cells if cell.reason is None)
+        for place, unit in enumerate(self.units):
+            for cell in self.cells:
+                if cell.reason is None:
+                    yield cell.head["run_hash"], unit.name
+                elif place == 0:  # what holds for every unit comes with the first
+                    yield cell.head["run_hash"], EVERY_UNIT
 
 
 def run(
@@ -194,7 +199,8 @@ def planned(asked: Asked, describe: Describe = environment.describe) -> Plan:
     task, extractor, dataset, seed = asked.task, asked.extractor, asked.dataset, asked.seed
     collection = task.collection(asked.images, dataset)
     hashes = {unit.name: unit.content_hash() for unit in collection.units}
-    public = Public(place=None if collection.scene is None else Place(collection.scene, extractor))
+    place = None if collection.scene is None else Place(collection.scene, extractor)
+    public = Public(kept.nearest_words, place=place)
     judged = {
         "name": collection.name,
         "spec": None if dataset is None else spec.written(dataset),

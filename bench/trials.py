@@ -57,6 +57,7 @@ class Trials:
 
     def __init__(self, plan: Plan) -> None:
         self.plan = plan
+        self._photographs = units.digest(list(plan.hashes.items()))  # in their order, by which others' releases come
         self._observed = functools.lru_cache(maxsize=1)(self._observe)
         self._shots = functools.lru_cache(maxsize=1)(self._release)
         self._population = functools.lru_cache(maxsize=None)(self._others)
@@ -141,25 +142,29 @@ class Trials:
         return next(cell for cell in self.plan.cells if cell.defense == defense)
 
     def _judged(self, cell: Cell, unit: Unit) -> Made:
-        plan, head = self.plan, cell.head
+        plan, head, attack = self.plan, cell.head, cell.attack
+        made_with = head["defense"], head["dataset"]["extractor"]
+        # Without what the task does with what was recovered: an attack that is painted by another inverter stays what it was.
+        attacked = attack and spec.configuration(attack, plan.public, attack.assets(cell.defense, plan.extractor, plan.public))
         observed, shots = self._observed(unit), self._shots(cell.defense, unit)
         content, first = plan.hashes[unit.name], shots[0].secret
         trial = Trial(
             unit=unit,
             shots=shots,
             defense=cell.defense,
-            attack=cell.attack,
+            attack=attack,
             extractor=plan.extractor,
             public=plan.public,
             metrics=plan.metrics,
-            rng=randomness("attack", plan.seed, content, head["defense"], head["dataset"]["extractor"], head["attack"]),
+            rng=randomness("attack", plan.seed, content, *made_with, attacked),
             others=self._population(cell.defense).without(unit.name),
-            repeats=tuple(self._protect(cell, first, content, number) for number in _repetitions(cell.attack)),
+            repeats=tuple(self._protect(cell, first, content, number) for number in _repetitions(attack)),
+            made_from={"seed": plan.seed, "photographs": self._photographs, "unit": unit.name, "made with": made_with},
         )
         started = time.perf_counter()
         with blamed(f"task {plan.task.name()}"):
             outcome = plan.task.judge(trial)
-        seconds = time.perf_counter() - started
+        seconds = time.perf_counter() - started + outcome.spared
         keypoints = max(len(shot.secret) for shot in shots)
         notes = [note for seen in observed for note in seen.notes]
         found = record(cell, unit, status="ok", outcome=outcome, keypoints=keypoints, notes=notes, seconds=seconds)

@@ -17,7 +17,11 @@ from bench.testing import NO_UNIT, shot
 from bench.types import Features, Release
 
 FAKES = {
-    "feature_privacy.attacks": {"painter": "fake_plugins.painter:PLUGIN", "guess": "fake_plugins.guess:PLUGIN"},
+    "feature_privacy.attacks": {
+        "painter": "fake_plugins.painter:PLUGIN",
+        "guess": "fake_plugins.guess:PLUGIN",
+        "fatal": "fake_plugins.fatal:PLUGIN",
+    },
     "feature_privacy.defenses": {"broken": "fake_plugins.broken:PLUGIN"},
 }
 

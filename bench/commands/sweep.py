@@ -24,7 +24,9 @@ def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("suite", nargs="?", metavar="SUITE", help="what to run; without it the suites are listed")
     parser.add_argument("--images", type=Path, metavar="DIR", help="a folder of photographs (default: those of the suite)")
     add_engine(parser)
-    parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the results; resumed if it exists (default: in runs/)")
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="folder for the results; resumed if it exists (default: in runs/)"
+    )
 
 
 def execute(args: argparse.Namespace) -> int:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from bench import fields, registry, spec, units
+from bench import fields, recovery, registry, spec, units
 from bench.errors import UnitError, UserError, blamed
 from bench.plugin import (
     Attack,
@@ -79,13 +79,15 @@ class Reconstruction(Task):
             return compared(trial, None, reconstructed(attack, view(trial), trial.rng))
         if not isinstance(attack, DescriptorAttack):
             raise UnitError("reconstruction needs an attack")
-        found, told = recovered(attack, trial)
+        found = recovery.recovered(attack, trial, view(trial))
         inverter, undefended, reason = self._inverter(trial.extractor, trial.public)
         if reason is not None:
-            return compared(trial, found, None, (*told, f"no image: {reason}"))
-        release = Descriptors(keypoints=trial.release.keypoints, size=trial.release.size, descriptors=found)
+            outcome = compared(trial, found.descriptors, None, (*found.notes, f"no image: {reason}"))
+            return dataclasses.replace(outcome, spared=found.spared)
+        release = Descriptors(keypoints=trial.release.keypoints, size=trial.release.size, descriptors=found.descriptors)
         seen = view(dataclasses.replace(trial.released(release), attack=inverter, defense=undefended))
-        return compared(trial, found, reconstructed(inverter, seen, trial.rng), told)
+        outcome = compared(trial, found.descriptors, reconstructed(inverter, seen, trial.rng), found.notes)
+        return dataclasses.replace(outcome, spared=found.spared)
 
     def _inverter(self, extractor: Extractor, public: Public) -> tuple[ImageAttack, Defense, str | None]:
         """The attack that paints descriptors, the defense that it was made for, and why it cannot be used, if it cannot."""
@@ -130,19 +132,10 @@ def reconstructed(attack: ImageAttack, seen: View, rng: np.random.Generator) -> 
     with blamed(f"plugin {attack.name()}"):
         image = attack.reconstruct(seen, rng)
         width, height = seen.release.size
-        _expect(image, (height, width, 3))
+        recovery.expect(image, (height, width, 3))
         if image.min() < 0 or image.max() > 1:
             raise ValueError(f"returned values from {image.min()} to {image.max()}, expected 0 to 1")
     return image
-
-
-def recovered(attack: DescriptorAttack, trial: Trial) -> tuple[Floats, tuple[str, ...]]:
-    """The attacker's descriptors, (N, D), and what he says of them."""
-    seen = view(trial)
-    with blamed(f"plugin {attack.name()}"):
-        descriptors = attack.recover(seen, trial.rng)
-        _expect(descriptors, trial.secret.descriptors.shape)
-    return descriptors, tuple(map(str, seen.notes))
 
 
 def compared(trial: Trial, descriptors: Floats | None, image: Floats | None, notes: tuple[str, ...] = ()) -> Outcome:
@@ -163,15 +156,6 @@ def _measured(
         if value is not None and not np.isfinite(value):
             raise ValueError(f"returned {value}; a metric returns None where its value is not finite")
         return None if value is None else float(value)
-
-
-def _expect(array: Any, shape: tuple[int, ...]) -> None:
-    if not isinstance(array, np.ndarray):
-        raise TypeError(f"returned {type(array).__name__}, expected a NumPy array")
-    if array.dtype != np.float32 or array.shape != shape:
-        raise ValueError(f"returned {array.dtype} {array.shape}, expected float32 {shape}")
-    if not np.isfinite(array).all():
-        raise ValueError("returned values that are not finite")
 
 
 PLUGIN = Reconstruction
