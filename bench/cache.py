@@ -33,6 +33,20 @@ def root() -> Path:
     return Path(os.environ.get(VARIABLE, "runs/cache"))
 
 
+@contextlib.contextmanager
+def within(folder: Path) -> Iterator[None]:
+    """Keep everything there for a while, and find nothing of what is kept elsewhere."""
+    before = os.environ.get(VARIABLE)
+    os.environ[VARIABLE] = str(folder)
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[VARIABLE]
+        else:
+            os.environ[VARIABLE] = before
+
+
 def fetch(kind: str, key: Any, make: Callable[[], Made], worth: float = 0.0) -> Made:
     """Arrays and metadata that `make` makes, unless they are kept already.
 

@@ -99,7 +99,8 @@ def shown(out: Path) -> Iterator[Table | Text]:
 
     found = status(out)
     names = labels([(cell.head["defense"], cell.head["attack"]) for cell in found.cells])
-    table = Table(title=Text(f"{out}: {told(found)}"), title_justify="left")
+    yield Text(f"{out}: {told(found)}")
+    table = Table()
     for column in ("task", "defense", "attack", "seed", "done", "running", "failed", "missing", "n/a"):
         table.add_column(column, overflow="fold", justify="left" if column in ("task", "defense", "attack", "n/a") else "right")
     for cell, (defense, attack) in zip(found.cells, names, strict=True):
@@ -143,8 +144,9 @@ def _writer(found: Status) -> str:
 
 
 def _state(key: tuple[str, str], found: Mapping[tuple[str, str], Record], in_hand: set[tuple[str, str]]) -> str:
+    record = found.get(key)
+    if record is not None and record["status"] != "failed":
+        return "done"
     if key in in_hand:
         return "running"
-    if key not in found:
-        return "missing"
-    return "failed" if found[key]["status"] == "failed" else "done"
+    return "missing" if record is None else "failed"

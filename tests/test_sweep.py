@@ -186,15 +186,13 @@ def test_a_process_that_is_killed_stops_the_run_and_the_rest_is_done_next_time(i
 
 
 @pytest.fixture(scope="module")
-def cluster() -> Iterator[Any]:
+def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    """Two workers, processes that know the made-up plugins."""
     distributed = pytest.importorskip("distributed", reason="needs dask.distributed: pip install distributed")
-    import dask
-
-    quiet = {"distributed.worker.multiprocessing.initializer": None, "distributed.admin.log-format": "%(message)s"}
-    with (
-        dask.config.set(quiet),
-        distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50) as started,
-    ):
+    with pytest.MonkeyPatch.context() as patch:
+        install(tmp_path_factory.mktemp("workers"), patch, FAKES)
+        started = distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50)
+    with started:
         yield started
 
 
