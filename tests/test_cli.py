@@ -56,7 +56,8 @@ def test_run_writes_everything_and_prints_the_table(bench: Bench, images: Path, 
     assert "guess attacks WordSets or Subspaces" in shown
     assert f"written to {out}" in told
     assert "\x1b" not in shown + told
-    assert {path.name for path in out.iterdir()} == {"records.jsonl", "report.md", "report.csv", "figures", "reconstructions"}
+    beside = {"plan.json", "report.md", "report.csv", "figures", "reconstructions"}
+    assert {path.name for path in out.iterdir()} == {"records.jsonl", *beside}
     assert {path.name for path in (out / "figures").iterdir()} == {"0.png.png", "1.png.png"}
     assert "sift upright" in (out / "report.md").read_text()
     before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}

@@ -366,7 +366,7 @@ def test_processes_make_the_same_records(images: Path, small: Asset, tmp_path: P
     (images / "bad.jpg").write_bytes(b"no photograph")
     engine = engines.choose(workers=2)
     plan = runner.prepare([LDP(epsilon=8, dictionary=small), Undefended()], [Painter(), Guess()], images, task=PAINT)
-    alone = list(runner.execute([plan], tmp_path / "alone"))
+    alone = runner.in_order([plan], runner.execute([plan], tmp_path / "alone"))
     together: Iterator[Record] = runner.execute([plan], tmp_path / "together", engine)
     next(together)
     next(together)

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -384,3 +385,24 @@ def test_interrupted_sweep_goes_on(mine: str, monkeypatch: pytest.MonkeyPatch, c
     assert bench(capfd, "sweep", mine)[0] == 0
     assert len(asked) == 7
     assert isinstance(suite.find(mine), Suite)
+
+
+# ---- the documentation
+
+DOCUMENT = (Path(__file__).resolve().parents[1] / "docs" / "sweeps.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("line", re.findall(r"^bench (.+?)(?:\s+#.*)?$", DOCUMENT, re.MULTILINE))
+def test_commands_of_the_documentation_are_understood(line: str) -> None:
+    args, extra = cli.parser().parse_known_args(line.split())
+    assert not extra
+    assert all(getattr(args, option) for option in args.required)
+
+
+def test_suite_of_the_documentation(images: Path) -> None:
+    code = next(block for block in re.findall(r"```python\n(.*?)```", DOCUMENT, re.DOTALL) if "SUITE" in block)
+    names: dict[str, Any] = {}
+    exec(code, names)
+    parts = names["SUITE"].parts
+    assert [part.seed for part in parts] == [0, 1, 2]
+    assert all(len(part.pairs) == 8 for part in parts)
