@@ -14,7 +14,7 @@ from typing import Any
 
 DISTRIBUTION = "feature-privacy-bench"
 PACKAGES = ("attacks", "bench", "defenses", "leaderboard", "metrics")
-LIBRARIES = ("numpy", "opencv-python-headless", "pillow", "pycolmap", "scikit-image", "torch")
+LIBRARIES = ("numpy", "opencv-python-headless", "pillow", "poselib", "pycolmap", "scikit-image", "torch")
 
 
 def describe(plugins: Iterable[object]) -> dict[str, Any]:

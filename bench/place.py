@@ -1,4 +1,4 @@
-"""A place as its server has it: the features of its reference images, and a dictionary clustered from them."""
+"""A place as its server has it: features of its reference images, and the map and the dictionaries that are made of them."""
 
 from __future__ import annotations
 
@@ -11,9 +11,12 @@ from bench.datasets.scene import Scene, SceneImage
 from bench.errors import UserError
 from bench.features import build, dictionary, kept
 from bench.features.dictionary import Dictionary
+from bench.localization import covisible, mapping, maps
+from bench.localization.maps import Map
+from bench.localization.retrieval import Bags
 from bench.plugin import Extractor
 from bench.progress import Progress
-from bench.types import Features
+from bench.types import Features, Indices
 
 WORDS = 32_000  # of the dictionary, unless it is said how many
 SEED = 0  # of the clustering
@@ -25,6 +28,9 @@ class Place:
     def __init__(self, scene: Scene, extractor: Extractor) -> None:
         self.scene = scene
         self.extractor = extractor
+        self._words: dict[str, Indices] = {}  # by the dictionary's digest
+        self._bags: dict[str, Bags] = {}
+        self.misfits: dict[str, float | None] = {}  # query -> by how much its focal length is off, where it is, once known
 
     @cached_property
     def digest(self) -> str:
@@ -35,6 +41,33 @@ class Place:
     def features(self, image: SceneImage) -> Features:
         """Of a reference or a query."""
         return kept.features(self.extractor, image.pixels)
+
+    @cached_property
+    def map(self) -> Map:
+        """The map of the references.
+
+        Raises
+        ------
+        UnitError
+            if a reference cannot be read.
+        UserError
+            if no point could be triangulated.
+        """
+        key = [self.digest, units.fingerprint(self.scene), provenance.source(mapping.__name__, covisible.__name__)]
+        arrays, meta = cache.fetch(maps.KIND, key, lambda: mapping.build(self.scene.references, self.references).to_arrays())
+        return maps.from_arrays(arrays, meta)
+
+    def words(self, known: Dictionary) -> Indices:
+        """What the map's keypoints quantise to. -> (T,)"""
+        if known.digest not in self._words:
+            self._words[known.digest] = known.index.nearest(self.map.descriptors if self.map.codes is None else self.map.codes)
+        return self._words[known.digest]
+
+    def bags(self, known: Dictionary) -> Bags:
+        """The references as bags of a dictionary's words."""
+        if known.digest not in self._bags:
+            self._bags[known.digest] = Bags(words=self.words(known), starts=self.map.starts, size=len(known))
+        return self._bags[known.digest]
 
     @cached_property
     def references(self) -> tuple[Features, ...]:

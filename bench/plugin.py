@@ -14,7 +14,7 @@ from bench.types import Bytes, Features, Floats, Indices, Knowledge, Release, Su
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from bench.datasets.scene import Scene
+    from bench.datasets.scene import Mask, Scene
     from bench.public import Public
     from bench.units import Collection, Images, Unit
 
@@ -180,7 +180,7 @@ def lifted(view: View) -> tuple[Subspaces, int]:
 
 
 class Attack(Plugin, ABC):
-    """Sees a `View` and tries to undo the defense. Subclass `DescriptorAttack` or `ImageAttack`."""
+    """Sees a `View` and tries to undo the defense. Subclass `DescriptorAttack`, `SelectiveAttack` or `ImageAttack`."""
 
     accepts: ClassVar[tuple[type[Release], ...]]
     needs: ClassVar[frozenset[Knowledge]] = frozenset()
@@ -214,6 +214,28 @@ class DescriptorAttack(Attack):
         """Return (N, D) float32 unit-norm estimates, in the order of the release's keypoints."""
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Selection:
+    """Descriptors of some of a release's keypoints."""
+
+    rows: Indices  # (R,) of the release
+    descriptors: Floats  # (R, D) unit norm
+
+
+class SelectiveAttack(Attack):
+    """Recovers descriptors where it can. Images are made of those keypoints alone, by the network for raw descriptors."""
+
+    @abstractmethod
+    def select(self, view: View, rng: np.random.Generator) -> Selection:
+        """Return the keypoints that it is sure of, and float32 estimates of their descriptors.
+
+        Raises
+        ------
+        UnitError
+            if there is none.
+        """
+
+
 class ImageAttack(Attack):
     """Recovers the photograph itself."""
 
@@ -235,6 +257,16 @@ class Metric(Plugin, ABC):
     @abstractmethod
     def __call__(self, truth: Floats, estimate: Floats) -> float | None:
         """Images are (H, W, 3) in [0, 1]; descriptors are (N, D). None where the value is not finite."""
+
+
+class LocalMetric(Metric):
+    """A metric of images that can be told for each pixel, so that parts of an image can be compared."""
+
+    compares = "images"
+
+    @abstractmethod
+    def local(self, truth: Floats, estimate: Floats) -> Floats:
+        """(H, W, 3) twice -> (H, W), the mean over channels."""
 
 
 class Dataset(Plugin, ABC):
@@ -278,6 +310,7 @@ class Shot:
     pixels: Callable[[], Bytes]  # (H, W, 3); read when it is asked for
     secret: Features
     release: Release
+    foreground: Callable[[], Mask | None] = lambda: None  # (H, W) where something hides the scene that moves, if that is known
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -15,25 +15,29 @@ import numpy as np
 
 from bench import cache, environment, provenance, spec
 from bench.errors import blamed
-from bench.plugin import DescriptorAttack, Trial, View
-from bench.types import Floats, Knowledge, Release
+from bench.plugin import Attack, DescriptorAttack, Selection, SelectiveAttack, Trial, View
+from bench.types import Knowledge, Release
 
 KIND = "recovered"
 WORTH = 1.0  # seconds; what took less is made again as soon as it is read
-# What makes the releases of other photographs, beside plugins.
-MAKERS = ("bench.population", "bench.randomness", "bench.trials")
+# What makes that which an attack may know beside the release.
+MAKERS = {
+    Knowledge.OTHER_RELEASES: "bench.population",
+    Knowledge.REPEATED_RELEASES: "bench.trials",
+    Knowledge.MAP: "bench.localization.server",
+}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Recovered:
-    """(N, D) estimates, what the attack says of them, and the seconds that were spared because they were kept."""
+    """What was recovered, what the attack says of it, and the seconds that were spared because it was kept."""
 
-    descriptors: Floats
+    selection: Selection
     notes: tuple[str, ...]
     spared: float = 0.0
 
 
-def recovered(attack: DescriptorAttack, trial: Trial, seen: View) -> Recovered:
+def recovered(attack: Attack, trial: Trial, seen: View) -> Recovered:
     """What the attack recovers, now or when it last saw the same. `trial.rng` is left as the attack left it."""
     if trial.made_from is None:
         return _attacked(attack, trial, seen)
@@ -45,11 +49,12 @@ def recovered(attack: DescriptorAttack, trial: Trial, seen: View) -> Recovered:
         found = _attacked(attack, trial, seen)
         spent = time.perf_counter() - started
         meta = {"notes": list(found.notes), "rng": trial.rng.bit_generator.state, "seconds": spent}
-        return {"descriptors": found.descriptors}, meta
+        return {"rows": found.selection.rows, "descriptors": found.selection.descriptors}, meta
 
     arrays, meta = cache.fetch(KIND, _key(attack, trial), make, WORTH)
     trial.rng.bit_generator.state = meta["rng"]
-    return Recovered(descriptors=arrays["descriptors"], notes=tuple(meta["notes"]), spared=meta["seconds"] - spent)
+    selection = Selection(rows=arrays["rows"], descriptors=arrays["descriptors"])
+    return Recovered(selection=selection, notes=tuple(meta["notes"]), spared=meta["seconds"] - spent)
 
 
 def expect(array: Any, shape: tuple[int, ...]) -> None:
@@ -62,24 +67,32 @@ def expect(array: Any, shape: tuple[int, ...]) -> None:
         raise ValueError("returned values that are not finite")
 
 
-def _attacked(attack: DescriptorAttack, trial: Trial, seen: View) -> Recovered:
+def _attacked(attack: Attack, trial: Trial, seen: View) -> Recovered:
+    truth = trial.secret.descriptors
     with blamed(f"plugin {attack.name()}"):
-        descriptors = attack.recover(seen, trial.rng)
-        expect(descriptors, trial.secret.descriptors.shape)
-    return Recovered(descriptors=descriptors, notes=tuple(map(str, seen.notes)))
+        if isinstance(attack, SelectiveAttack):
+            found = attack.select(seen, trial.rng)
+            expect(found.descriptors, truth[found.rows].shape)
+        elif isinstance(attack, DescriptorAttack):
+            found = Selection(rows=np.arange(len(truth)), descriptors=attack.recover(seen, trial.rng))
+            expect(found.descriptors, truth.shape)
+        else:
+            raise TypeError(f"{attack.name()} recovers neither descriptors nor images")
+    return Recovered(selection=found, notes=tuple(map(str, seen.notes)))
 
 
-def _key(attack: DescriptorAttack, trial: Trial) -> dict[str, Any]:
+def _key(attack: Attack, trial: Trial) -> dict[str, Any]:
     public, extractor = trial.public, trial.extractor
     known = {Knowledge.PUBLIC_DATABASE, Knowledge.TRAINING_IMAGES} & attack.needs
-    plugins = (attack, trial.defense, extractor)
+    modules = {type(plugin).__module__ for plugin in (attack, trial.defense, extractor)}
+    makers = {MAKERS[what] for what in attack.needs if what in MAKERS}
     return {
         "release": _digest(trial.release),
         "made from": trial.made_from,
         "attack": spec.configuration(attack, public, attack.assets(trial.defense, extractor, public)),
         "rng": trial.rng.bit_generator.state,
         "shipped": [public.digest(asset) for asset in ("shipped", "shipped-public")] if known else [],
-        "source": provenance.source(*(type(plugin).__module__ for plugin in plugins), *MAKERS),
+        "source": provenance.source(*sorted(modules | makers)),
         "environment": environment.computing(),
     }
 

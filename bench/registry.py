@@ -19,7 +19,7 @@ from typing import Any, Generic, TypeVar
 
 from bench import fields
 from bench.errors import UserError, unknown
-from bench.plugin import Dataset, Defense, DescriptorAttack, Extractor, ImageAttack, Metric, Plugin, Task
+from bench.plugin import Dataset, Defense, DescriptorAttack, Extractor, ImageAttack, Metric, Plugin, SelectiveAttack, Task
 
 P = TypeVar("P", bound=Plugin)
 
@@ -35,7 +35,9 @@ class Kind(Generic[P]):
 
 
 DEFENSE = Kind("defense", "defenses", "feature_privacy.defenses", (Defense,))
-ATTACK = Kind[DescriptorAttack | ImageAttack]("attack", "attacks", "feature_privacy.attacks", (DescriptorAttack, ImageAttack))
+ATTACK = Kind[DescriptorAttack | SelectiveAttack | ImageAttack](
+    "attack", "attacks", "feature_privacy.attacks", (DescriptorAttack, SelectiveAttack, ImageAttack)
+)
 METRIC = Kind("metric", "metrics", "feature_privacy.metrics", (Metric,))
 TASK = Kind("task", "bench.tasks", "feature_privacy.tasks", (Task,))
 DATASET = Kind("dataset", "bench.datasets", "feature_privacy.datasets", (Dataset,))

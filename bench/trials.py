@@ -57,7 +57,7 @@ class Trials:
 
     def __init__(self, plan: Plan) -> None:
         self.plan = plan
-        self._photographs = units.digest(list(plan.hashes.items()))  # in their order, by which others' releases come
+        self._order = units.digest(list(plan.hashes))  # in which the releases of others come
         self._observed = functools.lru_cache(maxsize=1)(self._observe)
         self._shots = functools.lru_cache(maxsize=1)(self._release)
         self._population = functools.lru_cache(maxsize=None)(self._others)
@@ -114,7 +114,8 @@ class Trials:
         for seen in self._observed(unit):
             content = self.plan.hashes[unit.name] if len(unit.images) == 1 else seen.image.content_hash()
             release = self._protect(cell, seen.features, content)
-            shots.append(Shot(pixels=seen.pixels, secret=seen.features, release=release))
+            foreground = functools.partial(units.foreground, seen.image)
+            shots.append(Shot(pixels=seen.pixels, secret=seen.features, release=release, foreground=foreground))
         return tuple(shots)
 
     def _protect(self, cell: Cell, features: Features, content: str, *repetition: int) -> Release:
@@ -159,7 +160,12 @@ class Trials:
             rng=randomness("attack", plan.seed, content, *made_with, attacked),
             others=self._population(cell.defense).without(unit.name),
             repeats=tuple(self._protect(cell, first, content, number) for number in _repetitions(attack)),
-            made_from={"seed": plan.seed, "photographs": self._photographs, "unit": unit.name, "made with": made_with},
+            made_from={
+                "seed": plan.seed,
+                "dataset": [head["dataset"]["hash"], self._order],
+                "unit": [unit.name, content],
+                "made with": made_with,
+            },
         )
         started = time.perf_counter()
         with blamed(f"task {plan.task.name()}"):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from bench.datasets import photographs
 from bench.datasets.photographs import Source
-from bench.datasets.scene import Pixels, Scene
+from bench.datasets.scene import Mask, Pixels, Scene
 from bench.errors import UserError
 from bench.records import canonical
 from bench.types import Bytes
@@ -114,6 +114,11 @@ def read(image: ImageSource) -> tuple[Bytes, tuple[str, ...]]:
         photograph = photographs.read(image.path)
         return photograph.pixels, photograph.notes
     return image.read(), ()
+
+
+def foreground(image: ImageSource) -> Mask | None:
+    """(H, W), True where something hides the scene that moves; None where that is not known."""
+    return None if isinstance(image, Source) else image.foreground()
 
 
 def path(image: ImageSource) -> Path | None:

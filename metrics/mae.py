@@ -8,23 +8,25 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from bench.kernels.pairs import image_pair
-from bench.plugin import Metric
+from bench.plugin import LocalMetric
 from bench.types import Floats
 
 
 @dataclass(frozen=True, kw_only=True)
-class MAE(Metric):
+class MAE(LocalMetric):
     """Mean absolute error over pixels and channels."""
 
-    compares: ClassVar[Literal["images", "descriptors"]] = "images"
     unit: ClassVar[str] = "intensity"
     range: ClassVar[tuple[float, float]] = (0.0, 1.0)
     higher_is_better_for: ClassVar[Literal["attacker", "defender"]] = "defender"
 
     def __call__(self, truth: Floats, estimate: Floats) -> float:
+        return float(self.local(truth, estimate).mean())
+
+    def local(self, truth: Floats, estimate: Floats) -> Floats:
         # (H, W, 3) in [0, 1] each
         true, estimated = image_pair(truth, estimate)
-        return float(np.abs(true - estimated).mean())
+        return np.abs(true - estimated).mean(axis=2)
 
 
 PLUGIN = MAE

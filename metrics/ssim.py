@@ -8,15 +8,14 @@ from types import MappingProxyType
 from typing import Any, ClassVar, Literal
 
 from bench.kernels.pairs import image_pair
-from bench.plugin import Metric
+from bench.plugin import LocalMetric
 from bench.types import Floats
 
 
 @dataclass(frozen=True, kw_only=True)
-class SSIM(Metric):
+class SSIM(LocalMetric):
     """Structural similarity, with the window and the constants of its authors, averaged over the channels."""
 
-    compares: ClassVar[Literal["images", "descriptors"]] = "images"
     unit: ClassVar[str] = "similarity"
     range: ClassVar[tuple[float, float]] = (-1.0, 1.0)
     higher_is_better_for: ClassVar[Literal["attacker", "defender"]] = "attacker"
@@ -31,6 +30,12 @@ class SSIM(Metric):
         # (H, W, 3) in [0, 1] each
         true, estimated = image_pair(truth, estimate)
         return float(structural_similarity(true, estimated, **self.parameters))
+
+    def local(self, truth: Floats, estimate: Floats) -> Floats:
+        from skimage.metrics import structural_similarity
+
+        true, estimated = image_pair(truth, estimate)
+        return structural_similarity(true, estimated, full=True, **self.parameters)[1].mean(axis=2)
 
 
 PLUGIN = SSIM

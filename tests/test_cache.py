@@ -178,7 +178,7 @@ def overwrite_with_one_direction(file: Path) -> None:
     arrays, meta, _ = tensorfile.load(file, "recovered")
     direction = np.zeros_like(arrays["descriptors"])
     direction[:, 0] = 1
-    tensorfile.save(file, "recovered", {"descriptors": direction}, meta)
+    tensorfile.save(file, "recovered", arrays | {"descriptors": direction}, meta)
 
 
 # ---- words, networks

@@ -108,7 +108,7 @@ def test_wrong_defense_is_refused_with_what_is_right(plugin: Any, complaint: str
 
 
 def test_attack_must_say_what_it_recovers() -> None:
-    with pytest.raises(UserError, match="DescriptorAttack or ImageAttack"):
+    with pytest.raises(UserError, match="DescriptorAttack or SelectiveAttack or ImageAttack"):
         registry.check(registry.ATTACK, frozen(Attack, accepts=(Descriptors,)))
 
 

@@ -20,7 +20,7 @@ from bench.tasks.reconstruction import Reconstruction
 from leaderboard.reproduce import figures, report, run, tables
 from leaderboard.reproduce.claims import Claim, Verdict, falling, same_order
 from leaderboard.reproduce.profiles import CPU, SMOKE, Materials, Setting
-from leaderboard.reproduce.run import Photographs, Ran
+from leaderboard.reproduce.run import Judged, Ran
 from leaderboard.reproduce.study import Measure, Row, Table, build
 
 TABLES = sorted(tables.everything())
@@ -183,7 +183,7 @@ def made_up(ssim: dict[str, list[float | None]]) -> run.Rebuilt:
         for name, values in ssim.items()
     }
     ran = Ran(rows=made_up_rows(setting), cells={name: name for name in ssim}, records=records)
-    return run.weigh(TABLE, setting, Photographs(name="photographs", chosen=(), available=8), ran)
+    return run.weigh(TABLE, setting, Judged(name="photographs", names=("0",) * 8, available=8), ran)
 
 
 def around(mean: float, count: int = 8) -> list[float | None]:

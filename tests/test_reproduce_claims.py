@@ -1,5 +1,6 @@
 """Verdicts: bootstrap against SciPy and enumeration, and claims that hold, fail and cannot be told on made-up numbers."""
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Mapping
@@ -24,7 +25,7 @@ from leaderboard.reproduce.claims import (
     judge,
     same_order,
 )
-from leaderboard.reproduce.intervals import RESAMPLES, interval, rank_correlation
+from leaderboard.reproduce.intervals import RESAMPLES, independent, interval, rank_correlation
 from leaderboard.reproduce.profiles import CPU, PROFILES, Materials, Setting
 from leaderboard.reproduce.study import printed
 from leaderboard.reproduce.tables import table4
@@ -109,6 +110,23 @@ def test_slack_and_equality() -> None:
     assert verdict(about_equal(A, B, 0.03), made_up({"a": 0.6, "b": 0.5}, 0.002)) is Verdict.FAILS
     assert verdict(about_equal(A, B, 0.03), made_up({"a": 0.4, "b": 0.5}, 0.002)) is Verdict.FAILS
     assert verdict(about_equal(A, B, 0.03), made_up({"a": 0.5, "b": 0.5}, 0.2)) is Verdict.OPEN
+
+
+def test_cells_of_different_units_are_compared_by_independent_resampling() -> None:
+    """Day and night have other queries: paired, nothing could be told."""
+    rng = np.random.default_rng(3)
+    day = pd.Series((rng.random(200) < 0.8).astype(float), index=[f"day {number}" for number in range(200)])
+    night = pd.Series((rng.random(100) < 0.3).astype(float), index=[f"night {number}" for number in range(100)])
+    values = pd.DataFrame({A: day, B: night})
+    unpaired = Statement(text="", weights={A: 1.0, B: -1.0}, above=0.0, paired=False)
+    assert verdict(unpaired, values) is Verdict.HOLDS
+    assert verdict(dataclasses.replace(unpaired, weights={A: -1.0, B: 1.0}), values) is Verdict.FAILS
+    assert verdict(dataclasses.replace(unpaired, paired=True), values) is Verdict.OPEN
+    ours = independent([day, night], [1.0, -1.0])
+    expected = stats.bootstrap((day, night), lambda x, y: x.mean() - y.mean(), method="percentile", random_state=1)
+    assert ours.mean == pytest.approx(day.mean() - night.mean())
+    assert (ours.low, ours.high) == pytest.approx(tuple(expected.confidence_interval), abs=0.01)
+    assert ours.count == 100
 
 
 def test_few_photographs_decide_nothing() -> None:

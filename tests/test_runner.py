@@ -11,13 +11,15 @@ from typing import Any
 import numpy as np
 import pytest
 from fake_plugins.broken import Broken
+from fake_plugins.glimpse import Glimpse
 from fake_plugins.guess import Guess
 from fake_plugins.painter import Painter
 from fakes import FAKES, album, install
 from PIL import Image
 
 from attacks.repeat import Repeat
-from bench import composition, engines, rundir, runner
+from bench import cache, composition, engines, rundir, runner
+from bench.datasets.gallery import Gallery
 from bench.errors import UserError
 from bench.plugin import Asset, Attack, Defense, Task, View
 from bench.records import FILE, Record
@@ -379,3 +381,28 @@ def test_processes_make_the_same_records(images: Path, small: Asset, tmp_path: P
         path.relative_to(tmp_path / "together"): path.read_bytes() for path in (tmp_path / "together").rglob("*.png")
     }
     assert {record["status"] for record in alone} == {"ok", "n/a", "failed"}
+
+
+def test_selected_keypoints_alone_are_scored_and_painted(images: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[int] = []
+    paint = Painter.reconstruct
+    monkeypatch.setattr(Painter, "reconstruct", lambda self, view, rng: seen.append(len(view.release)) or paint(self, view, rng))
+    found = run([Undefended()], [Glimpse()], images)
+    assert [record["metrics"]["l2"] for record in found] == [0, 0]
+    assert seen == [-(-record["metrics"]["keypoints"] // 2) for record in found]
+
+
+def test_foreground_and_background_are_told_apart_in_a_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(cache.VARIABLE, str(tmp_path / "cache"))
+    place = Gallery(views=1, queries=1, night=0, width=160, height=128, detail=0.2, people=4)
+    (record,) = runner.run([Undefended()], [Painter()], task=PAINT, dataset=place)
+    mask = place.scene().queries[0].pixels.foreground()
+    assert mask is not None
+    share = mask.mean()
+    assert 0 < share < 1
+    found = record["metrics"]
+    parts = share * found["mae_foreground"] + (1 - share) * found["mae_background"]
+    assert parts == pytest.approx(found["mae"])
+    assert found["mae_foreground"] != found["mae_background"]
+    assert record["condition"] == "day"
+    assert record["dataset"]["spec"]["name"] == "gallery"

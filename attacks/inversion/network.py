@@ -52,14 +52,18 @@ class Inverter(nn.Module):
         self.paint = nn.Conv2d(first, 3 * CELL * CELL, 3, padding=1)
 
     def forward(self, points: Points) -> Tensor:
-        level = self.stem(self.scatter(points))
+        rows, columns = points.grid
+        step = 2 ** len(self.down)  # of the deepest level's grid; an image of another size is painted with an empty margin
+        margin = (0, -columns % step, 0, -rows % step)
+        level = self.stem(nnf.pad(self.scatter(points), margin))
         levels = [level]
         for down in self.down:
             levels.append(down(levels[-1]))
         level = levels.pop()
         for up in self.up:
             level = up(level, levels.pop())
-        return nnf.pixel_shuffle(self.paint(level).float(), CELL) + 0.5  # (B, 3, H, W)
+        painted = self.paint(level)[:, :, :rows, :columns]
+        return nnf.pixel_shuffle(painted.float(), CELL) + 0.5  # (B, 3, H, W)
 
     def scatter(self, points: Points) -> Tensor:
         """-> (B, first, H/2, W/2), channels last"""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from bench.terminal import DONE, FAILED, add_extractor, add_seed, print_rich, say
+from bench.terminal import DONE, FAILED, add_extractor, add_seed, print_rich, say, whole
 
 SUMMARY = "rebuild a table of the paper, or its figures, beside the paper's"
 EPILOG = """Tables come with intervals over the photographs, and with a verdict on each claim of the paper.
@@ -22,6 +22,8 @@ def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("what", nargs="?", metavar="NAME", help="table1, table4, tableS3, tableS4, figures, ...")
     parser.add_argument("--profile", metavar="NAME", default="cpu", help="smoke, cpu or paper: the sizes (default: %(default)s)")
     parser.add_argument("--images", type=Path, metavar="DIR", help="a folder of photographs (default: the built-in ones)")
+    parser.add_argument("--dataset", metavar="SPEC", help="the place that tables of localization are about (default: a gallery)")
+    parser.add_argument("--workers", type=whole, metavar="N", help="processes, for such tables (default: one a core)")
     add_extractor(parser)
     add_seed(parser)
     parser.add_argument(
@@ -45,9 +47,11 @@ def execute(args: argparse.Namespace) -> int:
         args.what,
         args.profile,
         images=args.images,
+        dataset=None if args.dataset is None else spec.read(args.dataset, registry.DATASET),
         extractor=spec.read(args.extractor, registry.EXTRACTOR),
         seed=args.seed,
         out=args.out,
+        workers=args.workers,
         materials=materials,
     )
     print_rich(*done.shown)

@@ -9,8 +9,6 @@ of the one halfway down the list.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,8 +22,7 @@ from bench.datasets.photographs import Source, folder
 from bench.datasets.scene import File, Reference, Scene
 from bench.errors import UserError
 from bench.plugin import Dataset
-
-QUIET = 2  # glog's level of errors
+from bench.quietly import quietly
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,7 +64,7 @@ def _model(directory: Path, sources: list[Source]) -> Path:
     """The folder of the model of these very photographs, made unless it is kept."""
 
     def make(kept: Path) -> None:
-        with tempfile.TemporaryDirectory() as scratch, _quietly():
+        with tempfile.TemporaryDirectory() as scratch, quietly():
             _structure_from_motion(directory, [source.name for source in sources], Path(scratch)).write(kept)
 
     photographs = {source.name: source.content_hash() for source in sources}
@@ -87,17 +84,6 @@ def _structure_from_motion(directory: Path, names: list[str], scratch: Path) -> 
     if not models:
         raise UserError(f"{directory}: structure from motion found no model; do the photographs overlap?")
     return max(models.values(), key=lambda model: model.num_reg_images())
-
-
-@contextmanager
-def _quietly() -> Iterator[None]:
-    """Without COLMAP's log."""
-    before = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = QUIET
-    try:
-        yield
-    finally:
-        pycolmap.logging.minloglevel = before
 
 
 def _distance(found: dict[str, Placed], first: str, second: str) -> float:

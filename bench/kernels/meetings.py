@@ -88,14 +88,26 @@ def _screened(one: Subspaces, other: Subspaces, triangle: bool = False) -> Itera
     length = one.origins.shape[1]
     if one.dim + other.dim >= length:
         raise UserError(f"subspaces of dimensions {one.dim} and {other.dim} always meet in a space of {length}")
+    for top, left, squares in squared_distances(one, other, one.dim + other.dim + SPARE, triangle):
+        first, second = (squares < NEAR).nonzero(as_tuple=True)
+        yield first.cpu().numpy() + top, second.cpu().numpy() + left
+
+
+def squared_distances(
+    one: Subspaces, other: Subspaces, directions: int, triangle: bool = False
+) -> Iterator[tuple[int, int, Tensor]]:
+    """dist² of all pairs, block by block, after a projection onto so many fixed directions; onto D of them it changes nothing.
+
+    Returns
+    -------
+    The first row, the first column and (n, n') float32 of each block; `triangle` leaves out those below the diagonal.
+    """
     device = pick_device()
-    mine, theirs = (_projected(release, one.dim + other.dim + SPARE).to(device) for release in (one, other))  # (dim + 1, N, k)
+    mine, theirs = (_projected(release, directions).to(device) for release in (one, other))  # (dim + 1, N, k)
     columns = max(1, BLOCK // ((other.dim + 1) ** 2 * ROWS))
     for top in range(0, len(one), ROWS):
         for left in range(top // columns * columns if triangle else 0, len(other), columns):
-            squares = _squared_distances(mine[:, top : top + ROWS], theirs[:, left : left + columns])
-            first, second = (squares < NEAR).nonzero(as_tuple=True)
-            yield first.cpu().numpy() + top, second.cpu().numpy() + left
+            yield top, left, _squared_distances(mine[:, top : top + ROWS], theirs[:, left : left + columns])
 
 
 def _projected(release: Subspaces, count: int) -> Tensor:

@@ -4,23 +4,25 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from bench import fields, recovery, registry, spec, units
+from bench.datasets.scene import Mask
 from bench.errors import UnitError, UserError, blamed
 from bench.plugin import (
     Attack,
     Dataset,
     Defense,
-    DescriptorAttack,
     Extractor,
     ImageAttack,
+    LocalMetric,
     Metric,
     Outcome,
+    Selection,
     Task,
     Trial,
     View,
@@ -66,7 +68,7 @@ class Reconstruction(Task):
             if what in attack.needs:
                 load()
         digests = dict(attack.assets(defense, extractor, public))
-        if not isinstance(attack, DescriptorAttack):
+        if isinstance(attack, ImageAttack):
             return digests
         inverter, undefended, reason = self._inverter(extractor, public)
         if reason is not None:
@@ -75,18 +77,19 @@ class Reconstruction(Task):
 
     def judge(self, trial: Trial) -> Outcome:
         attack = trial.attack
+        if attack is None:
+            raise UnitError("reconstruction needs an attack")
         if isinstance(attack, ImageAttack):
             return compared(trial, None, reconstructed(attack, view(trial), trial.rng))
-        if not isinstance(attack, DescriptorAttack):
-            raise UnitError("reconstruction needs an attack")
         found = recovery.recovered(attack, trial, view(trial))
         inverter, undefended, reason = self._inverter(trial.extractor, trial.public)
         if reason is not None:
-            outcome = compared(trial, found.descriptors, None, (*found.notes, f"no image: {reason}"))
+            outcome = compared(trial, found.selection, None, (*found.notes, f"no image: {reason}"))
             return dataclasses.replace(outcome, spared=found.spared)
-        release = Descriptors(keypoints=trial.release.keypoints, size=trial.release.size, descriptors=found.descriptors)
+        keypoints = trial.release.keypoints[found.selection.rows]
+        release = Descriptors(keypoints=keypoints, size=trial.release.size, descriptors=found.selection.descriptors)
         seen = view(dataclasses.replace(trial.released(release), attack=inverter, defense=undefended))
-        outcome = compared(trial, found.descriptors, reconstructed(inverter, seen, trial.rng), found.notes)
+        outcome = compared(trial, found.selection, reconstructed(inverter, seen, trial.rng), found.notes)
         return dataclasses.replace(outcome, spared=found.spared)
 
     def _inverter(self, extractor: Extractor, public: Public) -> tuple[ImageAttack, Defense, str | None]:
@@ -108,6 +111,8 @@ def offered(attack: Attack, defense: Defense, public: Public) -> dict[Knowledge,
     }
     if "database" in databases:
         offers[Knowledge.DATABASE] = lambda: public.dictionary(databases["database"])
+    if public.place is not None:
+        offers[Knowledge.MAP] = lambda: public.place
     return offers
 
 
@@ -118,6 +123,7 @@ def view(trial: Trial) -> View:
     offers = offered(attack, trial.defense, trial.public) | {
         Knowledge.OTHER_RELEASES: lambda: lambda count: map(copy.deepcopy, trial.others(count)),
         Knowledge.REPEATED_RELEASES: lambda: copy.deepcopy(list(trial.repeats)),
+        Knowledge.MAP: lambda: _served(trial),
     }
     return View(
         release=copy.deepcopy(trial.release),  # whatever the attack does to it, the next attack sees what was released
@@ -125,6 +131,12 @@ def view(trial: Trial) -> View:
         extractor=trial.extractor,
         knowledge={what: load for what, load in offers.items() if what in attack.needs},
     )
+
+
+def _served(trial: Trial) -> Any:
+    from bench.localization.server import Server  # it brings COLMAP with it
+
+    return Server(public=trial.public, camera=trial.unit.subject.camera)
 
 
 def reconstructed(attack: ImageAttack, seen: View, rng: np.random.Generator) -> Floats:
@@ -138,19 +150,34 @@ def reconstructed(attack: ImageAttack, seen: View, rng: np.random.Generator) -> 
     return image
 
 
-def compared(trial: Trial, descriptors: Floats | None, image: Floats | None, notes: tuple[str, ...] = ()) -> Outcome:
-    """Every metric of what was recovered; None for a metric of what was not."""
+def compared(trial: Trial, found: Selection | None, image: Floats | None, notes: tuple[str, ...] = ()) -> Outcome:
+    """Every metric of what was recovered; None for a metric of what was not. Of an image with a foreground, its parts as well."""
+    values: dict[str, float | None] = {}
     truth = (trial.pixels() / 255.0).astype(np.float32)
-    values = {metric.name(): _measured(metric, trial.secret.descriptors, truth, descriptors, image) for metric in trial.metrics}
+    for metric in trial.metrics:
+        if metric.compares == "images":
+            values[metric.name()] = None if image is None else _measured(metric, truth, image)
+        else:
+            described = None if found is None else _measured(metric, trial.secret.descriptors[found.rows], found.descriptors)
+            values[metric.name()] = described
+    if image is not None and (mask := trial.shots[0].foreground()) is not None:
+        values |= parts(trial.metrics, truth, image, mask)
     return Outcome(metrics=values, image=image, notes=notes)
 
 
-def _measured(
-    metric: Metric, true_descriptors: Floats, true_image: Floats, descriptors: Floats | None, image: Floats | None
-) -> float | None:
-    truth, estimate = (true_image, image) if metric.compares == "images" else (true_descriptors, descriptors)
-    if estimate is None:
-        return None
+def parts(metrics: Sequence[Metric], truth: Floats, image: Floats, mask: Mask) -> dict[str, float | None]:
+    """Those metrics that can be told for each pixel, over the foreground and over the rest; None for an empty part."""
+    values: dict[str, float | None] = {}
+    for metric in metrics:
+        if isinstance(metric, LocalMetric):
+            with blamed(f"plugin {metric.name()}"):
+                each = metric.local(truth, image)  # (H, W)
+            for part, inside in (("foreground", mask), ("background", ~mask)):
+                values[f"{metric.name()}_{part}"] = float(each[inside].mean()) if inside.any() else None
+    return values
+
+
+def _measured(metric: Metric, truth: Floats, estimate: Floats) -> float | None:
     with blamed(f"plugin {metric.name()}"):
         value = metric(truth, estimate)
         if value is not None and not np.isfinite(value):

@@ -1,8 +1,9 @@
 """Claims of the paper, what they say of cells, and whether they hold here.
 
 A claim is a list of statements. A statement says that a linear combination of cells lies in an open interval, where a cell is
-the mean over photographs of a measure in a row; "A > B" says so of A − B and (0, ∞). It is judged by the paired bootstrap of that
-combination: it holds if the interval lies inside, does not hold if it lies outside, and cannot be told if it lies astride.
+the mean over units, such as photographs, of a measure in a row; "A > B" says so of A − B and (0, ∞). It is judged by the
+bootstrap, paired by unit, of that combination: it holds if the interval lies inside, does not hold if it lies outside, and cannot
+be told if it lies astride.
 """
 
 from __future__ import annotations
@@ -15,11 +16,11 @@ from enum import Enum
 
 import pandas as pd
 
-from leaderboard.reproduce.intervals import Interval, interval
+from leaderboard.reproduce.intervals import Interval, independent, interval
 
 Cell = tuple[str, str]  # a row's name, a measure
 
-# Of fewer photographs even a sign that all share is no evidence at 95%: of five, p = 2 · 2^-5.
+# Of fewer units even a sign that all share is no evidence at 95%: of five, p = 2 · 2^-5.
 FEWEST = 6
 
 
@@ -39,6 +40,7 @@ class Statement:
     weights: Mapping[Cell, float]
     above: float = -math.inf
     below: float = math.inf
+    paired: bool = True  # whether its cells are of the same units; if not, each is resampled by itself
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +53,7 @@ class Claim:
 
 @dataclass(frozen=True, kw_only=True)
 class Evidence:
-    """A statement with the paper's value, ours over the photographs that have all its cells, and the verdict."""
+    """A statement with the paper's value, ours over the units that have all its cells, and the verdict."""
 
     statement: Statement
     paper: float | None
@@ -114,7 +116,7 @@ def judge(
 
     Parameters
     ----------
-    values : a column for each cell, a row for each photograph; missing where there is none
+    values : a column for each cell, a row for each unit; missing where there is none
     paper : the paper's value of each cell that it prints
     reasons : why rows have no values, by name, for those that have none
     """
@@ -127,14 +129,21 @@ def judge(
 def _weigh(statement: Statement, values: pd.DataFrame, paper: Mapping[Cell, float], reasons: Mapping[str, str]) -> Evidence:
     weights = statement.weights
     printed = sum(weight * paper[cell] for cell, weight in weights.items()) if weights.keys() <= paper.keys() else None
-    complete = values.reindex(columns=pd.MultiIndex.from_tuples(weights)).dropna()  # (photographs, cells)
+    if not statement.paired:
+        columns = [values[cell].dropna() if cell in values else pd.Series(dtype=float) for cell in weights]
+        if all(map(len, columns)):
+            return _evidence(statement, printed, independent(columns, list(weights.values())))
+    complete = values.reindex(columns=pd.MultiIndex.from_tuples(weights)).dropna()  # (units, cells)
     if complete.empty:
         missing = dict.fromkeys(row for row, _ in weights if row in reasons)
-        reason = "; ".join(f"{row}: {reasons[row]}" for row in missing) or "no photograph has all of these cells"
+        reason = "; ".join(f"{row}: {reasons[row]}" for row in missing) or "no unit has all of these cells"
         return Evidence(statement=statement, paper=printed, ours=None, verdict=Verdict.OPEN, reason=reason)
-    ours = interval(complete.to_numpy() @ list(weights.values()))
+    return _evidence(statement, printed, interval(complete.to_numpy() @ list(weights.values())))
+
+
+def _evidence(statement: Statement, printed: float | None, ours: Interval) -> Evidence:
     if ours.count < FEWEST:
-        reason = f"{ours.count} photographs; at least {FEWEST} are needed"
+        reason = f"{ours.count} units; at least {FEWEST} are needed"
         return Evidence(statement=statement, paper=printed, ours=ours, verdict=Verdict.OPEN, reason=reason)
     return Evidence(statement=statement, paper=printed, ours=ours, verdict=_verdict(statement, ours))
 

@@ -9,12 +9,13 @@ from pathlib import Path
 
 from rich.text import Text
 
-from bench.errors import unknown
-from bench.plugin import Asset, Extractor
+from bench import engines, threads
+from bench.errors import UserError, unknown
+from bench.plugin import Asset, Dataset, Extractor
 from leaderboard.reproduce import figures, report, run, tables
 from leaderboard.reproduce.drawing import Scene, save
 from leaderboard.reproduce.profiles import Materials, Setting, profile
-from leaderboard.reproduce.run import Photographs
+from leaderboard.reproduce.run import Judged
 
 FIGURES = "figures"
 
@@ -33,9 +34,11 @@ def reproduce(
     size: str,
     *,
     images: Path | None,
+    dataset: Dataset | None,
     extractor: Extractor,
     seed: int,
     out: Path | None,
+    workers: int | None,
     materials: Mapping[str, str],
 ) -> Done:
     """Rebuild the table `name` at the profile `size`, and write it.
@@ -51,29 +54,44 @@ def reproduce(
     if name not in (FIGURES, *known):
         raise unknown("table", name, [FIGURES, *known])
     sizes = profile(size)
-    chosen = run.choose(images, sizes, sizes.pictures if name == FIGURES else sizes.photographs)
+    of_place = name in known and known[name].place
+    if of_place and images is not None:
+        raise UserError(f"{name} is about a place: name it with --dataset, and give no --images")
+    if not of_place and dataset is not None:
+        raise UserError(f"{name} is about photographs: name them with --images, and give no --dataset")
+    if of_place:
+        judged = run.queries(dataset or sizes.place)
+    else:
+        judged = run.choose(images, sizes, sizes.pictures if name == FIGURES else sizes.photographs)
     setting = Setting(
         profile=sizes,
         materials=Materials(**{field: Asset(file) for field, file in materials.items()}),
         extractor=extractor,
-        photographs=len(chosen.chosen),
+        photographs=len(judged.chosen),
         seed=seed,
     )
-    folder = out or Path("runs") / f"reproduce-{sizes.name}-{'builtin' if images is None else images.resolve().name}"
+    folder = out or Path("runs") / f"reproduce-{sizes.name}-{_named(images, judged)}"
     if name == FIGURES:
-        return _figures(setting, chosen, folder)
-    rebuilt = run.rebuild(known[name], setting, chosen, folder)
+        return _figures(setting, judged, folder)
+    engine = engines.choose(workers or (threads.cores() if of_place else 1))
+    rebuilt = run.rebuild(known[name], setting, judged, folder, engine)
     report.write(rebuilt, folder)
     return Done(out=folder, shown=tuple(report.to_rich(rebuilt)), failed=run.failures(rebuilt.ran))
 
 
-def _figures(setting: Setting, chosen: Photographs, out: Path) -> Done:
+def _named(images: Path | None, judged: Judged) -> str:
+    if judged.dataset is not None:
+        return judged.dataset.name()
+    return "builtin" if images is None else images.resolve().name
+
+
+def _figures(setting: Setting, judged: Judged, out: Path) -> Done:
     """Run the rows of all figures, and draw them into `out`/reproduced."""
     drawings = figures.everything()
     left_out = {drawing.name: reason for drawing in drawings if (reason := drawing.left_out())}
     rows = {row.name: row for drawing in drawings if drawing.name not in left_out for row in drawing.rows(setting)}
-    ran = run.execute(list(rows.values()), setting, chosen.chosen, out, FIGURES)
-    scene = Scene(setting=setting, photographs=chosen, ran=ran, out=out)
+    ran = run.execute(list(rows.values()), setting, judged, out, FIGURES)
+    scene = Scene(setting=setting, judged=judged, ran=ran, out=out)
     shown = [Text(f"left out: {name}: {reason}") for name, reason in left_out.items()]
     for drawing in drawings:
         if drawing.name not in left_out:

@@ -18,7 +18,7 @@ from bench.rundir import picture
 from bench.types import Bytes
 from leaderboard.figures import Panel
 from leaderboard.reproduce.profiles import Setting
-from leaderboard.reproduce.run import Photographs, Ran, of
+from leaderboard.reproduce.run import Judged, Ran, of
 from leaderboard.reproduce.study import Row
 
 if TYPE_CHECKING:
@@ -32,13 +32,13 @@ class Scene:
     """What a figure is drawn from."""
 
     setting: Setting
-    photographs: Photographs
+    judged: Judged
     ran: Ran
     out: Path
 
     def originals(self) -> Iterator[tuple[Source, Bytes]]:
         """The photographs that can be read, and their pixels."""
-        for source in self.photographs.chosen:
+        for source in self.judged.chosen:
             with contextlib.suppress(UnitError):
                 yield source, photographs.read(source.path).pixels
 

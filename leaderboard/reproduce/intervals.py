@@ -1,4 +1,4 @@
-"""How sure a mean over photographs is: percentile bootstrap (Efron 1979)."""
+"""How sure a mean over units is: percentile bootstrap (Efron 1979), and for a share, Wilson's interval."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
+from scipy.stats import binomtest
 
 LEVEL = 0.95
 RESAMPLES = 10_000
@@ -22,7 +23,7 @@ class Interval:
     mean: float
     low: float
     high: float
-    count: int  # photographs
+    count: int  # units, such as photographs
 
 
 def interval(values: ArrayLike) -> Interval:
@@ -37,6 +38,25 @@ def interval(values: ArrayLike) -> Interval:
     means = sample[drawn].mean(axis=1)  # (RESAMPLES,)
     low, high = np.quantile(means, ((1 - LEVEL) / 2, (1 + LEVEL) / 2))
     return Interval(float(sample.mean()), float(low), float(high), len(sample))
+
+
+def independent(samples: Sequence[ArrayLike], weights: Sequence[float]) -> Interval:
+    """Σ weight · mean of samples that have nothing to do with each other, each resampled by itself; `count` is the smallest's."""
+    total, resampled = 0.0, np.zeros(RESAMPLES)
+    for rng, values, weight in zip(np.random.default_rng(SEED).spawn(len(samples)), samples, weights, strict=True):
+        sample = np.asarray(values, dtype=np.float64)
+        drawn = rng.integers(len(sample), size=(RESAMPLES, len(sample)))
+        total += weight * float(sample.mean())
+        resampled += weight * sample[drawn].mean(axis=1)
+    low, high = np.quantile(resampled, ((1 - LEVEL) / 2, (1 + LEVEL) / 2))
+    return Interval(total, float(low), float(high), min(len(np.asarray(values)) for values in samples))
+
+
+def proportion(hits: ArrayLike, times: float = 1.0) -> Interval:
+    """The share of (n,) trials, each 1 or 0, that are hits, with Wilson's interval (1927); all multiplied by `times`."""
+    sample = np.asarray(hits, dtype=np.float64)
+    found = binomtest(int(sample.sum()), len(sample)).proportion_ci(LEVEL, method="wilson")
+    return Interval(float(sample.mean()) * times, float(found.low) * times, float(found.high) * times, len(sample))
 
 
 def rank_correlation(one: Sequence[float], other: Sequence[float]) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from bench.datasets.gallery import Gallery
 from bench.errors import unknown
 from bench.plugin import Asset, Extractor
 
@@ -20,6 +21,9 @@ class Profile:
     scale: float  # of every |K| of a table that varies it; every ε is shifted by its logarithm
     subspaces: int  # that Table S3 lifts, in all
     others: int  # releases of other photographs that Table S4 looks at, at most
+    place: Gallery  # that tables of localization are about, unless another is named
+    place_scale: float  # as `scale`, for such a table
+    trials: float  # of RANSAC, as a share of the paper's
     # Fields of attacks that are set for want of time, where an attack has them; otherwise attacks are as they were tuned.
     reduced: Mapping[str, int] = field(default_factory=dict)
 
@@ -33,10 +37,35 @@ SMOKE = Profile(
     scale=0.5,
     subspaces=40,
     others=8,
+    place=Gallery(views=12, queries=6, width=320, height=240, rooms=1, detail=0.5),
+    place_scale=1 / 512,
+    trials=1 / 10_000,
     reduced={"others": 8},
 )
-CPU = Profile(name="cpu", photographs=16, builtin=None, pictures=3, scale=0.5, subspaces=20_000, others=1600)
-PAPER = Profile(name="paper", photographs=1_000_000, builtin=None, pictures=10, scale=1.0, subspaces=100_000, others=1600)
+CPU = Profile(
+    name="cpu",
+    photographs=16,
+    builtin=None,
+    pictures=3,
+    scale=0.5,
+    subspaces=20_000,
+    others=1600,
+    place=Gallery(),
+    place_scale=1 / 16,
+    trials=0.003,
+)
+PAPER = Profile(
+    name="paper",
+    photographs=1_000_000,
+    builtin=None,
+    pictures=10,
+    scale=1.0,
+    subspaces=100_000,
+    others=1600,
+    place=Gallery(),
+    place_scale=1.0,
+    trials=1.0,
+)
 PROFILES = {profile.name: profile for profile in (SMOKE, CPU, PAPER)}
 
 

@@ -24,7 +24,10 @@ if TYPE_CHECKING:
 DIGITS = 4  # of the numbers that speak for a verdict
 SHORT = 12  # statements of a claim that are all written out; of more, those that do not hold or cannot be told
 MOST = 12  # of these that a terminal shows
-INTERVALS = f"In brackets: {LEVEL:.0%} percentile bootstrap over photographs; a verdict rests on that of the paired combination."
+INTERVALS = (
+    f"In brackets: {LEVEL:.0%}, by percentile bootstrap over photographs or queries, of shares Wilson's; a verdict rests on the "
+    "bootstrap of the paired combination."
+)
 
 
 def write(rebuilt: Rebuilt, out: Path) -> list[Path]:
@@ -49,11 +52,11 @@ def write(rebuilt: Rebuilt, out: Path) -> list[Path]:
 
 def heading(rebuilt: Rebuilt) -> str:
     """What was measured, on what."""
-    photographs, setting = rebuilt.photographs, rebuilt.setting
-    count, features = len(photographs.chosen), extractor_label(spec.written(setting.extractor))
-    of_all = "" if count == photographs.available else f" of {photographs.available}"
+    judged, setting = rebuilt.judged, rebuilt.setting
+    count, features = len(judged.names), extractor_label(spec.written(setting.extractor))
+    of_all = "" if count == judged.available else f" of {judged.available}"
     return (
-        f"{rebuilt.table.title}; profile {setting.profile.name}, {count}{of_all} {photographs.name}, {features} features, "
+        f"{rebuilt.table.title}; profile {setting.profile.name}, {count}{of_all} {judged.name}, {features} features, "
         f"seed {setting.seed}"
     )
 
@@ -151,11 +154,8 @@ def plain(rebuilt: Rebuilt) -> dict[str, Any]:
         "title": rebuilt.table.title,
         "profile": setting.profile.name,
         "scale": setting.profile.scale,
-        "photographs": {
-            "of": rebuilt.photographs.name,
-            "names": [source.name for source in rebuilt.photographs.chosen],
-            "available": rebuilt.photographs.available,
-        },
+        "units": {"of": rebuilt.judged.name, "names": list(rebuilt.judged.names), "available": rebuilt.judged.available},
+        "dataset": None if rebuilt.judged.dataset is None else spec.written(rebuilt.judged.dataset),
         "extractor": spec.written(setting.extractor),
         "seed": setting.seed,
         "rows": [_row(row, rebuilt) for row in rebuilt.ran.rows],

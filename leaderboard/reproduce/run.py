@@ -11,24 +11,27 @@ import pandas as pd
 from bench import runner
 from bench.datasets import photographs
 from bench.datasets.photographs import Source
-from bench.plugin import Task
+from bench.engines import HERE, Engine
+from bench.plugin import Dataset, Task
 from bench.progress import Progress
 from bench.records import Record
 from bench.runner import Plan
 from leaderboard.reproduce import study
 from leaderboard.reproduce.claims import Cell, Finding, judge
-from leaderboard.reproduce.intervals import Interval, interval, rank_correlation
+from leaderboard.reproduce.intervals import Interval, interval, proportion, rank_correlation
 from leaderboard.reproduce.profiles import Profile, Setting
-from leaderboard.reproduce.study import Row, Table
+from leaderboard.reproduce.study import Measure, Row, Table
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Photographs:
-    """What a reproduction is made of."""
+class Judged:
+    """What a reproduction is made of: photographs, or the queries or the whole of a place."""
 
-    name: str
-    chosen: tuple[Source, ...]
+    name: str  # in words, in the plural
+    names: tuple[str, ...]
     available: int
+    chosen: tuple[Source, ...] = ()  # the photographs
+    dataset: Dataset | None = None  # the place
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -46,7 +49,7 @@ class Rebuilt:
 
     table: Table
     setting: Setting
-    photographs: Photographs
+    judged: Judged
     ran: Ran
     ours: Mapping[Cell, Interval]  # those that there are
     notes: Mapping[str, str]  # row's name -> why it has no values, or what a reader should know of them
@@ -54,7 +57,7 @@ class Rebuilt:
     findings: tuple[Finding, ...]
 
 
-def choose(images: Path | None, profile: Profile, most: int) -> Photographs:
+def choose(images: Path | None, profile: Profile, most: int) -> Judged:
     """The photographs of a folder by name, or the built-in ones that the profile takes, at most so many.
 
     Raises
@@ -64,13 +67,29 @@ def choose(images: Path | None, profile: Profile, most: int) -> Photographs:
     """
     if images is None:
         sources = [source for source in photographs.builtin() if profile.builtin is None or source.name in profile.builtin]
-        return Photographs(name="built-in photographs", chosen=tuple(sources[:most]), available=len(sources))
-    sources = photographs.folder(images)
-    name = f"photographs of {images.resolve().name}"
-    return Photographs(name=name, chosen=tuple(sources[:most]), available=len(sources))
+        return _photographs("built-in photographs", sources, most)
+    return _photographs(f"photographs of {images.resolve().name}", photographs.folder(images), most)
 
 
-def rebuild(table: Table, setting: Setting, chosen: Photographs, out: Path) -> Rebuilt:
+def _photographs(name: str, sources: Sequence[Source], most: int) -> Judged:
+    chosen = tuple(sources[:most])
+    return Judged(name=name, names=tuple(source.name for source in chosen), available=len(sources), chosen=chosen)
+
+
+def queries(dataset: Dataset) -> Judged:
+    """All queries of a place.
+
+    Raises
+    ------
+    UserError
+        if it is damaged.
+    """
+    scene = dataset.scene()
+    names = tuple(query.name for query in scene.queries)
+    return Judged(name=f"queries of {scene.name}", names=names, available=len(names), dataset=dataset)
+
+
+def rebuild(table: Table, setting: Setting, judged: Judged, out: Path, engine: Engine = HERE) -> Rebuilt:
     """Run what `out` does not hold yet, and weigh the claims.
 
     Raises
@@ -79,16 +98,16 @@ def rebuild(table: Table, setting: Setting, chosen: Photographs, out: Path) -> R
         if a file is missing or does not fit; nothing has been written then.
     """
     rows = (*table.rows(setting), *table.borrowed(setting))
-    return weigh(table, setting, chosen, execute(rows, setting, chosen.chosen, out, table.name))
+    return weigh(table, setting, judged, execute(rows, setting, judged, out, table.name, engine))
 
 
-def execute(rows: Sequence[Row], setting: Setting, sources: Sequence[Source], out: Path, title: str) -> Ran:
-    """Run the rows on the photographs, one plan for each task; records that `out` holds are not made again."""
-    plans = [_plan(task, rows, setting, sources) for task in dict.fromkeys(row.task for row in rows)]
+def execute(rows: Sequence[Row], setting: Setting, judged: Judged, out: Path, title: str, engine: Engine = HERE) -> Ran:
+    """Run the rows, one plan for each task; records that `out` holds are not made again."""
+    plans = [_plan(task, rows, setting, judged) for task in dict.fromkeys(row.task for row in rows)]
     cells = {row.name: _cell(row, plans) for row in rows}
     found: list[Record] = []
-    with Progress(f"{title}: {len(sources)} photographs, {len(rows)} rows", sum(map(len, plans))) as progress:
-        for record in runner.execute(plans, out):
+    with Progress(f"{title}: {len(judged.names)} {judged.name}, {len(rows)} rows", sum(map(len, plans))) as progress:
+        for record in runner.execute(plans, out, engine):
             found.append(record)
             progress.advance(note=record["unit"])
             if record["status"] == "failed":
@@ -99,16 +118,16 @@ def execute(rows: Sequence[Row], setting: Setting, sources: Sequence[Source], ou
     return Ran(rows=tuple(rows), cells=cells, records={cell: tuple(its) for cell, its in records.items()})
 
 
-def weigh(table: Table, setting: Setting, chosen: Photographs, ran: Ran) -> Rebuilt:
+def weigh(table: Table, setting: Setting, judged: Judged, ran: Ran) -> Rebuilt:
     """Means, intervals, rank correlation and verdicts from records alone."""
     reasons = {row.name: reason for row in ran.rows if (reason := _reason(of(ran, row.name)))}
     columns = _columns(table, ran)
     paper = study.printed(ran.rows)
-    ours = {cell: interval(column) for cell, column in columns.items() if len(column)}
+    ours = {cell: _interval(table.measures[cell[1]], column) for cell, column in columns.items() if len(column)}
     return Rebuilt(
         table=table,
         setting=setting,
-        photographs=chosen,
+        judged=judged,
         ran=ran,
         ours=ours,
         notes={row.name: reasons.get(row.name) or _notes(of(ran, row.name)) for row in ran.rows},
@@ -127,11 +146,17 @@ def failures(ran: Ran) -> int:
     return sum(record["status"] == "failed" for records in ran.records.values() for record in records)
 
 
-def _plan(task: Task, rows: Sequence[Row], setting: Setting, sources: Sequence[Source]) -> Plan:
+def _interval(measure: Measure, column: pd.Series) -> Interval:
+    return proportion(column / measure.times, measure.times) if measure.share else interval(column)
+
+
+def _plan(task: Task, rows: Sequence[Row], setting: Setting, judged: Judged) -> Plan:
     pairs = [(row.defense, row.attack) for row in rows if row.task == task]
     defenses = list(dict.fromkeys(defense for defense, _ in pairs))
     pairs.sort(key=lambda pair: defenses.index(pair[0]))  # so that each photograph is protected once by each
-    return runner.prepare_pairs(pairs, sources, task=task, extractor=setting.extractor, seed=setting.seed)
+    return runner.prepare_pairs(
+        pairs, judged.chosen or None, task=task, extractor=setting.extractor, dataset=judged.dataset, seed=setting.seed
+    )
 
 
 def _cell(row: Row, plans: Sequence[Plan]) -> str:
@@ -145,13 +170,15 @@ def _cell(row: Row, plans: Sequence[Plan]) -> str:
 
 
 def _columns(table: Table, ran: Ran) -> dict[Cell, pd.Series]:
-    """The values of each cell by photograph, in the paper's unit."""
+    """The values of each cell by unit, in the paper's unit of measurement."""
     return {
         (row.name, measure): pd.Series(
             {
                 record["unit"]: record["metrics"][wanted.metric] * wanted.times
                 for record in of(ran, row.name)
-                if record["status"] == "ok" and record["metrics"].get(wanted.metric) is not None
+                if record["status"] == "ok"
+                and record["metrics"].get(wanted.metric) is not None
+                and wanted.condition in (None, record["condition"])
             },
             dtype=float,
         )

@@ -35,6 +35,8 @@ class Measure:
     metric: str
     times: float = 1.0  # from our unit to the paper's
     digits: int = 3  # shown after the point
+    condition: str | None = None  # of the units that count, if not all do
+    share: bool = False  # whether each unit has 1 or 0 of it
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,6 +48,7 @@ class Table:
     measures: Mapping[str, Measure]
     rows: Callable[[Setting], tuple[Row, ...]]
     claims: Callable[[Mapping[Cell, float]], tuple[Claim, ...]]  # given the paper's values of all cells
+    place: bool = False  # whether it is about the queries of a place
     ordered: str | None = None  # the measure by which paper's and our rows are ranked
     # Rows of other tables that claims compare with.
     borrowed: Callable[[Setting], tuple[Row, ...]] = field(default=lambda setting: ())

@@ -11,7 +11,7 @@ from leaderboard.reproduce.profiles import CPU, Materials, Setting
 
 
 def of_table(name: str) -> Suite:
-    """The rows of a table with what is shipped, on the built-in photographs, and the rows of others that its claims compare with.
+    """The rows of a table, and those of others that its claims compare with, with what is shipped: photographs or a place.
 
     Records are those of `bench reproduce`, which finds them if it is given the folder.
     """
@@ -24,7 +24,7 @@ def of_table(name: str) -> Suite:
             images=None,
             task=task,
             extractor=extractor,
-            dataset=None,
+            dataset=CPU.place if table.place else None,
             seed=0,
         )
         for task in dict.fromkeys(row.task for row in rows)

@@ -1,0 +1,46 @@
+"""The inlier attack: the server keeps the keypoints that RANSAC verified, with the descriptors that their matches reveal.
+
+The paper's supplement: what is static and in the map appears in the image, and what moves before it does not. It holds for any
+release that a server can localize, whatever it promises of one descriptor: the map tells the rest.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bench.errors import UnitError
+from bench.localization import matching
+from bench.plugin import Selection, SelectiveAttack, View
+from bench.types import Descriptors, Knowledge, Subspaces, WordSets
+
+
+@dataclass(frozen=True, kw_only=True)
+class Inlier(SelectiveAttack):
+    """Paints from those keypoints that the server could verify, by the map's descriptors of the points that they are of."""
+
+    accepts = (Descriptors, Subspaces, WordSets)
+    needs = frozenset({Knowledge.MAP})
+
+    retrieved: int = 20  # references that a query is matched with
+    trials: int = 30_000  # of RANSAC, at most
+
+    def select(self, view: View, rng: np.random.Generator) -> Selection:
+        server = view.know(Knowledge.MAP)
+        matcher = matching.default(view.defense)
+        if matcher is None:
+            raise UnitError(f"nothing matches {type(view.release).__name__}")
+        references = server.seen_in(view.release, view.defense, self.retrieved)
+        known, seed = server.dictionary(view.defense), int(rng.integers(2**31))
+        found = server.localize(view.release, known, references, matcher, self.trials, seed)
+        if found.estimate is None or not found.estimate.inliers.any():
+            raise UnitError("no keypoint was verified")
+        keypoints = found.correspondences.keypoints[found.estimate.inliers]
+        seen = server.place.map.descriptors[found.correspondences.rows[found.estimate.inliers]]
+        rows, first = np.unique(keypoints, return_index=True)
+        view.notes.append(f"{len(rows)} keypoints verified")
+        return Selection(rows=rows, descriptors=seen[first])
+
+
+PLUGIN = Inlier

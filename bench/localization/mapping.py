@@ -1,0 +1,123 @@
+"""Makes the map of a place: matches among neighbouring references, and points triangulated from their known poses.
+
+A match is kept if it agrees with the poses: COLMAP's Sampson error of at most `EPIPOLAR` pixels. What is left goes through
+`pycolmap.Database` to COLMAP's triangulation, in one thread and with a seed, so that the same images make the same map.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import torch
+
+from bench.datasets.scene import Reference
+from bench.device import pick_device
+from bench.errors import UserError
+from bench.kernels.distances import mutual, points_to_points
+from bench.localization import covisible
+from bench.localization.maps import Map
+from bench.progress import Progress
+from bench.quietly import quietly
+from bench.types import Features, Indices
+
+RATIO = 0.8  # of the ratio test among references
+EPIPOLAR = 4.0  # pixels
+
+Matches = dict[tuple[int, int], Indices]  # references a < b -> (M, 2) keypoints of a, of b
+
+
+def build(references: Sequence[Reference], features: Sequence[Features]) -> Map:
+    """The map of references whose features were extracted.
+
+    Raises
+    ------
+    UserError
+        if no point could be triangulated.
+    """
+    matches = verified(references, features, _matched(features, covisible.pairs(references)))
+    points, xyz = triangulate(references, features, matches)
+    if len(xyz) == 0:
+        raise UserError("the map has no point: do the references overlap?")
+    codes = [each.codes for each in features if each.codes is not None]
+    return Map(
+        names=tuple(reference.name for reference in references),
+        starts=np.concatenate([[0], np.cumsum([len(each) for each in features])]).astype(np.int64),
+        keypoints=np.concatenate([each.keypoints for each in features]),
+        descriptors=np.concatenate([each.descriptors for each in features]),
+        codes=np.concatenate(codes) if len(codes) == len(features) else None,
+        points=points,
+        xyz=xyz,
+    )
+
+
+def verified(
+    references: Sequence[Reference], features: Sequence[Features], matches: Iterable[tuple[tuple[int, int], Indices]]
+) -> Matches:
+    """The matches that agree with the known poses."""
+    rays = [_rays(reference, each) for reference, each in zip(references, features, strict=True)]
+    kept = {}
+    for (a, b), found in matches:
+        essential = pycolmap.essential_matrix_from_pose(references[b].cam_from_world * references[a].cam_from_world.inverse())
+        errors = np.asarray(pycolmap.compute_squared_sampson_error(rays[a][found[:, 0]], rays[b][found[:, 1]], essential))
+        focal = (references[a].camera.mean_focal_length() + references[b].camera.mean_focal_length()) / 2
+        kept[a, b] = found[errors * focal**2 <= EPIPOLAR**2]
+    return kept
+
+
+def triangulate(references: Sequence[Reference], features: Sequence[Features], matches: Matches) -> tuple[Indices, np.ndarray]:
+    """COLMAP's points. -> (T,) point of each keypoint of all references, or -1; (P, 3)"""
+    with tempfile.TemporaryDirectory() as scratch, quietly():
+        database = Path(scratch) / "database.db"
+        model = _prepared(database, references, features, matches)
+        options = pycolmap.IncrementalPipelineOptions(num_threads=1, random_seed=0, extract_colors=False)
+        options.mapper.num_threads = 1
+        model = pycolmap.triangulate_points(model, database, scratch, scratch, options=options)
+    ids = sorted(model.points3D)
+    rows = {point: row for row, point in enumerate(ids)}
+    points = [
+        [rows[point.point3D_id] if point.has_point3D() else -1 for point in model.images[number].points2D]
+        for number in range(1, len(references) + 1)
+    ]
+    return np.concatenate(points).astype(np.int64), np.array([model.points3D[point].xyz for point in ids]).reshape(-1, 3)
+
+
+def _matched(features: Sequence[Features], pairs: Sequence[tuple[int, int]]) -> Iterable[tuple[tuple[int, int], Indices]]:
+    device = pick_device()
+    rows = [torch.from_numpy(each.descriptors).to(device) for each in features]
+    with Progress("map: matches", len(pairs)) as progress:
+        for a, b in pairs:
+            yield (a, b), np.stack(mutual(points_to_points(rows[a], rows[b]), RATIO), axis=1)
+            progress.advance()
+
+
+def _prepared(
+    database: Path, references: Sequence[Reference], features: Sequence[Features], matches: Matches
+) -> pycolmap.Reconstruction:
+    """A model with poses and no point, and a database with what COLMAP triangulates them from. Numbers count from 1."""
+    model = pycolmap.Reconstruction()
+    with pycolmap.Database.open(database) as opened:
+        for number, (reference, each) in enumerate(zip(references, features, strict=True), 1):
+            camera = pycolmap.Camera(reference.camera.todict() | {"camera_id": number})
+            model.add_camera_with_trivial_rig(camera)
+            image = pycolmap.Image(reference.name, each.keypoints.astype(np.float64), camera_id=number, image_id=number)
+            model.add_image_with_trivial_frame(image, reference.cam_from_world)
+            opened.write_camera(camera, use_camera_id=True)
+            opened.write_rig(model.rig(number), use_rig_id=True)
+            opened.write_frame(model.frame(number), use_frame_id=True)
+            opened.write_image(model.image(number), use_image_id=True)
+            opened.write_keypoints(number, each.keypoints)
+        for (a, b), found in matches.items():
+            pair = pycolmap.TwoViewGeometry()
+            pair.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+            pair.inlier_matches = found.astype(np.uint32)
+            opened.write_two_view_geometry(a + 1, b + 1, pair)
+    return model
+
+
+def _rays(reference: Reference, features: Features) -> np.ndarray:
+    """Where the keypoints lie on the plane at depth one. -> (N, 2) float64"""
+    return np.asarray(reference.camera.cam_from_img(features.keypoints.astype(np.float64)))

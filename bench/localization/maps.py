@@ -1,0 +1,56 @@
+"""The server's map: the keypoints of all references, their descriptors, and the 3D points that they are seen to be."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.kernels.search import unit_rows
+from bench.tensorfile import Arrays
+from bench.types import Bytes, Floats, Indices
+
+KIND = "map"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Map:
+    """T keypoints of V references, one reference after the other, and P points."""
+
+    names: tuple[str, ...]  # (V,) of the references
+    starts: Indices  # (V + 1,) keypoints starts[v] up to starts[v + 1] are of reference v
+    keypoints: Floats  # (T, 2)
+    descriptors: Floats  # (T, D) unit norm
+    codes: Bytes | None  # (T, D) the 8-bit vectors that the descriptors came from, where there are any
+    points: Indices  # (T,) the row of `xyz` that a keypoint is an image of, or -1
+    xyz: NDArray[np.float64]  # (P, 3) in the scene's unit of length
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def rows(self, reference: int) -> slice:
+        """The keypoints of one reference."""
+        return slice(int(self.starts[reference]), int(self.starts[reference + 1]))
+
+    def to_arrays(self) -> tuple[Arrays, dict[str, Any]]:
+        """What a file of tensors holds of it, and its metadata. Descriptors that came from codes are not stored."""
+        arrays: Arrays = {"starts": self.starts, "keypoints": self.keypoints, "points": self.points, "xyz": self.xyz}
+        stored: Arrays = {"descriptors": self.descriptors} if self.codes is None else {"codes": self.codes}
+        return arrays | stored, {"names": list(self.names)}
+
+
+def from_arrays(arrays: Arrays, meta: Mapping[str, Any]) -> Map:
+    """The map that `to_arrays` took apart."""
+    codes = arrays.get("codes")
+    return Map(
+        names=tuple(meta["names"]),
+        starts=arrays["starts"],
+        keypoints=arrays["keypoints"],
+        descriptors=arrays["descriptors"] if codes is None else unit_rows(codes),
+        codes=codes,
+        points=arrays["points"],
+        xyz=arrays["xyz"],
+    )

@@ -1,0 +1,133 @@
+"""Localization: how near a server comes to the pose of the camera that a release is from (the paper's Sec. 6.2).
+
+Queries are privatised, references are not. For each query the server retrieves references, matches the release with them, and
+estimates the pose with fixed intrinsics. A query that it cannot localize counts as not localized.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from bench import units
+from bench.datasets.gallery import Gallery
+from bench.datasets.scene import SceneImage
+from bench.errors import UnitError, UserError
+from bench.localization import matching, pairs, pose
+from bench.localization.server import Server
+from bench.plugin import Attack, Dataset, Defense, Extractor, Outcome, Task, Trial
+from bench.public import Public
+from bench.types import Features, Indices
+from bench.units import Collection, Images
+
+# Within which a pose counts: units of length and degrees (Sattler et al., CVPR 2018).
+THRESHOLDS = {"0.25m_2deg": (0.25, 2.0), "0.5m_5deg": (0.5, 5.0), "5m_10deg": (5.0, 10.0)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Localization(Task):
+    """How many queries of a place a server can localize from what was released of them.
+
+    Retrieval is `raw` (by the raw descriptors of the query, the same for every defense, as in the paper, where it leaks what the
+    paper does not count) or `released` (by nothing but what was released), unless a file of pairs is given.
+    """
+
+    attacked: ClassVar[bool] = False
+    places: ClassVar[bool] = True
+
+    matcher: Literal["auto", "vocabulary", "mutual-nn", "point-to-subspace"] = "auto"  # auto: what serves the release best
+    retrieval: Literal["raw", "released"] = "raw"
+    retrieved: int = 20  # references of a query
+    trials: int = 30_000  # of RANSAC, at most
+    pairs: Path | None = None  # a file in hloc's format that says which references were retrieved
+
+    def __post_init__(self) -> None:
+        if self.retrieved < 1 or self.trials < 1:
+            raise UserError("localization: retrieved and trials must be at least 1")
+
+    def collection(self, images: Images, dataset: Dataset | None) -> Collection:
+        if images is not None:
+            raise UserError("localization is about the queries of a dataset and takes no images; give --dataset")
+        collection = units.of_queries(dataset or Gallery())
+        if all(unit.subject.cam_from_world is None for unit in collection.units):
+            raise UserError(f"{collection.name}: the poses of its queries are withheld; nothing could be measured")
+        return collection
+
+    def inapplicable(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> str | None:
+        name = self._matcher(defense)
+        return f"nothing matches {defense.releases.__name__}" if name is None else matching.inapplicable(name, defense)
+
+    def resolved(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> Mapping[str, Any]:
+        return {}
+
+    def judge(self, trial: Trial) -> Outcome:
+        query: SceneImage = trial.unit.subject
+        server = Server(public=trial.public, camera=query.camera)
+        _check(server, trial.secret, query.name)
+        matcher = self._matcher(trial.defense)
+        if matcher is None:
+            raise UnitError(f"nothing matches {type(trial.release).__name__}")
+        references, seed = self._retrieved(server, trial, query), int(trial.rng.integers(2**31))
+        known = server.dictionary(trial.defense)
+        found = server.localize(trial.release, known, references, matcher, self.trials, seed)
+        told = {
+            "matches": float(len(found.correspondences)),
+            "inliers": 0.0 if found.estimate is None else float(found.estimate.inliers.sum()),
+            "trials": 0.0 if found.estimate is None else float(found.estimate.trials),
+        }
+        if query.cam_from_world is None:
+            return Outcome(metrics=told, notes=("its pose is withheld",))
+        errors = None if found.estimate is None else pose.errors(found.estimate.cam_from_world, query.cam_from_world)
+        return Outcome(metrics={**within(errors), **told})
+
+    def _matcher(self, defense: Defense) -> str | None:
+        return matching.default(defense) if self.matcher == "auto" else self.matcher
+
+    def _retrieved(self, server: Server, trial: Trial, query: SceneImage) -> Indices:
+        if self.pairs is not None:
+            return listed(self.pairs, query.name, server.place.map.names)[: self.retrieved]
+        if self.retrieval == "raw":
+            return server.seen_by(trial.secret, self.retrieved)
+        return server.seen_in(trial.release, trial.defense, self.retrieved)
+
+
+def _check(server: Server, secret: Features, query: str) -> None:
+    """Raise UnitError if the intrinsics are wrong; found out by raw features, so that all defenses have the same queries."""
+    known = server.place.misfits
+    if query not in known:
+        known[query] = server.misfit(secret)
+    if (ratio := known[query]) is not None:
+        raise UnitError(f"{query}: its intrinsics do not fit; its raw features ask for {ratio:.2f} times the focal length")
+
+
+def within(errors: tuple[float, float] | None) -> dict[str, float | None]:
+    """Which thresholds a pose meets, and its errors; None is a query that was not localized."""
+    translation, rotation = (None, None) if errors is None else errors
+    met = {
+        f"recall_{name}": float(errors is not None and errors[0] <= length and errors[1] <= angle)
+        for name, (length, angle) in THRESHOLDS.items()
+    }
+    return {**met, "translation_error": translation, "rotation_error": rotation}
+
+
+def listed(path: Path, query: str, names: tuple[str, ...]) -> Indices:
+    """The references that a file of pairs lists for a query.
+
+    Raises
+    ------
+    UserError
+        if the file is damaged, or names a reference that the map does not have.
+    """
+    places = {name: place for place, name in enumerate(names)}
+    wanted = pairs.read(path).get(query, [])
+    missing = [name for name in wanted if name not in places]
+    if missing:
+        raise UserError(f"{path}: {missing[0]} is no reference of the map")
+    return np.array([places[name] for name in wanted], dtype=np.int64)
+
+
+PLUGIN = Localization
