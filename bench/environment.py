@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 DISTRIBUTION = "feature-privacy-bench"
+# Without `suites`, which say what is run, and have no part in how.
 PACKAGES = ("attacks", "bench", "defenses", "leaderboard", "metrics")
 LIBRARIES = ("numpy", "opencv-python-headless", "pillow", "poselib", "pycolmap", "scikit-image", "torch")
 

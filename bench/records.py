@@ -127,6 +127,7 @@ class Log:
     """A file of records, open to append; each record is handed to the system before the next unit begins.
 
     It is locked while it is open. Whenever its process ends, however that is, the system lifts the lock.
+    `before` is what the file held when it was locked.
     """
 
     def __init__(self, path: Path) -> None:
@@ -145,7 +146,8 @@ class Log:
         try:
             if not _lock(self._file, fcntl.LOCK_EX):
                 raise UserError(f"--out: another process is writing to {path}; wait for it, or name another folder")
-            self._file.truncate(read(path).whole)
+            self.before = read(path)
+            self._file.truncate(self.before.whole)
         except UserError:
             self._file.close()
             raise

@@ -254,13 +254,11 @@ def execute(plans: Sequence[Plan], out: Path | None = None, engine: Engine = eng
     if out is None:
         yield from (made.record for made in _made(plans, set(), engine))
         return
-    file = out / records.FILE
-    before = records.read(file) if file.is_file() else records.Contents([], 0)
-    if before.notice:
-        logging.getLogger(__name__).warning(before.notice)
-    with records.Log(file) as log:
+    with records.Log(out / records.FILE) as log:
+        if log.before.notice:
+            logging.getLogger(__name__).warning(log.before.notice)
         rundir.write_plan(out, plans)
-        done = {records.key(record): record for record in before.records if record["status"] != "failed"}
+        done = {records.key(record): record for record in log.before.records if record["status"] != "failed"}
         held = [done[key] for key in dict.fromkeys(key for plan in plans for key in plan.record_keys()) if key in done]
         yield from held
         with rundir.InHand(out, engine.name) as hand:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from concurrent.futures import CancelledError
 from typing import TYPE_CHECKING, Any
 
 from bench import trials
@@ -55,6 +56,8 @@ class Cluster(Engine):
             for job, future in submitted:
                 try:
                     yield future.result()
+                except CancelledError:
+                    raise UserError(f"--scheduler {self._scheduler}: the scheduler was lost; run again to go on") from None
                 except KilledWorker:
                     reason = "every worker that began this ended, perhaps for want of memory"
                     yield Made(record=trials.record(job.cell, job.unit, status="failed", reason=reason))
