@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Iterator
 from concurrent.futures import CancelledError
 from typing import TYPE_CHECKING, Any
@@ -67,6 +68,7 @@ class Cluster(Engine):
             from distributed import Client
         except ImportError:
             raise UserError("--engine dask needs distributed: pip install 'feature-privacy-bench[dask]'") from None
+        logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # what matters of it is told by our errors
         try:
             return Client(self._scheduler, timeout=PATIENCE, set_as_default=False)
         except (OSError, ValueError) as error:
