@@ -4,7 +4,10 @@ BIN := .venv/bin
 DEMO ?= --defense none --defense affine --defense ldp:epsilon=16 --defense ldp --attack dia --attack nearest
 DATA ?= ../shared/data
 
-.PHONY: demo test lint bench assets
+SMOKE := --defense none --defense affine --defense ldp:epsilon=16 --attack dia
+SPEED := runs/speed.json
+
+.PHONY: demo test lint smoke check baseline bench assets
 
 demo: .venv/ready
 	$(BIN)/bench run $(DEMO)
@@ -17,8 +20,21 @@ lint: .venv/ready-to-test
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-bench: .venv/ready-to-test # speed, as ratios within one run
-	$(BIN)/pytest -q --benchmark-only --benchmark-columns=min,median,rounds --benchmark-sort=name
+smoke: .venv/ready # with three seeds, whose spread says what may be chance
+	for seed in 0 1 2; do $(BIN)/bench run $(SMOKE) --seed $$seed --out runs/smoke > /dev/null || exit; done
+
+check: smoke # against what was found good; fails if privacy got worse, or an attack weaker
+	$(BIN)/bench check --baseline tests/baseline.jsonl --results runs/smoke
+
+baseline: # after a change that is meant
+	rm -rf runs/smoke
+	$(MAKE) smoke
+	cp runs/smoke/records.jsonl tests/baseline.jsonl
+
+bench: .venv/ready-to-test # speed, as ratios within one run, against what was found good
+	mkdir -p $(dir $(SPEED))
+	$(BIN)/pytest -q --benchmark-only --benchmark-columns=min,median,rounds --benchmark-sort=name --benchmark-json=$(SPEED)
+	$(BIN)/bench check --baseline tests/speed.json --results $(SPEED)
 
 assets: .venv/ready # hours: rebuilds the dictionaries and networks that are shipped
 	$(BIN)/python tools/make_assets.py --data $(DATA) --work work/assets

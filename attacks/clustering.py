@@ -19,7 +19,7 @@ import numpy as np
 
 from bench.errors import UserError
 from bench.kernels.search import unit_rows
-from bench.kernels.sharing import company, nearest_that_meet
+from bench.kernels.sharing import Company, company, nearest_that_meet
 from bench.kernels.subspaces import Doubles, feet_and_frames, nearest_to_subspaces
 from bench.plugin import Asset, Defense, DescriptorAttack, Extractor, View, leads_through_no_word, lifted
 from bench.public import Public
@@ -62,10 +62,7 @@ class Clustering(DescriptorAttack):
         d = candidates(release, z, found, distances, clusters)  # (N, k, D)
         shared = company(release, view.know(Knowledge.OTHER_RELEASES)(self.others), words, self.coverage)
         view.notes.append(shared.summary())
-        far = nearest_that_meet(d, shared)  # (N, k)
-        met = np.isfinite(far).all(axis=1)  # (N,)
-        best = np.where(met, far.argmax(axis=1), np.abs(d).sum(axis=2).argmin(axis=1))
-        return unit_rows(d[np.arange(len(d)), best].astype(np.float32))
+        return chosen(d, shared)
 
 
 def candidates(release: Subspaces, words: Bytes, found: Indices, distances: Doubles, clusters: int) -> Doubles:
@@ -80,6 +77,14 @@ def candidates(release: Subspaces, words: Bytes, found: Indices, distances: Doub
         means[batch] = (weights / weights.sum(axis=2, keepdims=True)) @ v
     offsets = means - feet[:, None]
     return feet[:, None] + (offsets @ frames.transpose(0, 2, 1)) @ frames
+
+
+def chosen(d: Doubles, shared: Company) -> Floats:
+    """Of the candidates of each subspace, that which no subspace that meets it comes near (Step 4). (N, k, D) -> (N, D)"""
+    far = nearest_that_meet(d, shared)  # (N, k)
+    met = np.isfinite(far).all(axis=1)  # (N,)
+    best = np.where(met, far.argmax(axis=1), np.abs(d).sum(axis=2).argmin(axis=1))
+    return unit_rows(d[np.arange(len(d)), best].astype(np.float32))
 
 
 def clustered(rows: Floats, clusters: int) -> Indices:

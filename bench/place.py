@@ -15,7 +15,6 @@ from bench.localization import covisible, mapping, maps
 from bench.localization.maps import Map
 from bench.localization.retrieval import Bags
 from bench.plugin import Extractor
-from bench.progress import Progress
 from bench.types import Features, Indices
 
 WORDS = 32_000  # of the dictionary, unless it is said how many
@@ -78,12 +77,7 @@ class Place:
         UnitError
             if one of them cannot be read.
         """
-        found = []
-        with Progress("reference images", len(self.scene.references)) as progress:
-            for image in self.scene.references:
-                found.append(self.features(image))
-                progress.advance(note=image.name)
-        return tuple(found)
+        return tuple(kept.all_features(self.extractor, [image.pixels for image in self.scene.references]))
 
     def dictionary(self, words: int) -> Dictionary:
         """So many words clustered from the references' descriptors; `WORDS` for 0.

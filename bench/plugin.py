@@ -206,6 +206,15 @@ class Attack(Plugin, ABC):
         return self.unsuited(defense, extractor, public)
 
 
+# Carries out a method of an attack, such as `attack.recover`, on what it sees.
+CarryOut = Callable[[Callable[[View, np.random.Generator], Any], View, np.random.Generator], Any]
+
+
+def at_once(method: Callable[[View, np.random.Generator], Any], view: View, rng: np.random.Generator) -> Any:
+    """Carry it out here and now. `bench.isolation` does it in another process."""
+    return method(view, rng)
+
+
 class DescriptorAttack(Attack):
     """Recovers one descriptor a keypoint. Images are then made by the network for raw descriptors."""
 
@@ -327,6 +336,7 @@ class Trial:
     rng: np.random.Generator
     others: Callable[[int], Iterator[Release]]  # the first so many releases of other photographs
     repeats: tuple[Release, ...]  # further releases of the first image's features
+    carry_out: CarryOut = at_once  # where the attack is carried out
     made_from: Mapping[str, Any] | None = None  # JSON: all that the releases are a function of; None keeps nothing of the trial
 
     @property

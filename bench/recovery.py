@@ -71,11 +71,12 @@ def _attacked(attack: Attack, trial: Trial, seen: View) -> Recovered:
     truth = trial.secret.descriptors
     with blamed(f"plugin {attack.name()}"):
         if isinstance(attack, SelectiveAttack):
-            found = attack.select(seen, trial.rng)
+            found = trial.carry_out(attack.select, seen, trial.rng)
             expect(found.descriptors, truth[found.rows].shape)
         elif isinstance(attack, DescriptorAttack):
-            found = Selection(rows=np.arange(len(truth)), descriptors=attack.recover(seen, trial.rng))
-            expect(found.descriptors, truth.shape)
+            descriptors = trial.carry_out(attack.recover, seen, trial.rng)
+            expect(descriptors, truth.shape)
+            found = Selection(rows=np.arange(len(truth)), descriptors=descriptors)
         else:
             raise TypeError(f"{attack.name()} recovers neither descriptors nor images")
     return Recovered(selection=found, notes=tuple(map(str, seen.notes)))

@@ -11,17 +11,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bench import engines, environment, records, registry, rundir, spec, trials, units
+from bench import engines, environment, fields, records, registry, rundir, spec, trials, units
 from bench.engines import Engine, Job
 from bench.errors import UserError
 from bench.features import kept
 from bench.features.sift import Sift
 from bench.place import Place
-from bench.plugin import Attack, Dataset, Defense, Extractor, Metric, Privacy, Task
+from bench.plugin import Attack, CarryOut, Dataset, Defense, Extractor, Metric, Plugin, Privacy, Task, at_once
 from bench.public import Public
 from bench.records import EVERY_UNIT, Record
 from bench.tasks.reconstruction import Reconstruction
 from bench.trials import Made, Trials
+from bench.types import Knowledge
 from bench.units import Images, Unit
 
 Describe = Callable[[Iterable[object]], Mapping[str, Any]]  # from plugins to the environment that they run in
@@ -48,6 +49,7 @@ class Asked:
     extractor: Extractor
     dataset: Dataset | None
     seed: int
+    metrics: tuple[Metric, ...] = ()  # beside those that need nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,11 +65,17 @@ class Plan:
     metrics: tuple[Metric, ...]
     public: Public
     seed: int
+    carry_out: CarryOut = at_once  # where attacks are carried out
 
     @property
     def hash(self) -> str:
         """Of configuration and inputs."""
         return records.short_hash(sorted(cell.head["cell_id"] for cell in self.cells))
+
+    @property
+    def needs_map(self) -> bool:
+        """Whether some cell will ask for the place's map."""
+        return self.task.places or any(cell.attack is not None and Knowledge.MAP in cell.attack.needs for cell in self.cells)
 
     def __len__(self) -> int:
         """The number of its records."""
@@ -92,6 +100,7 @@ def run(
     task: Task | None = None,
     dataset: Dataset | None = None,
     seed: int = 0,
+    metrics: Sequence[Metric] = (),
     out: Path | str | None = None,
 ) -> list[Record]:
     """Run every defense against every attack, and return one record for each unit, such as a photograph, of each pair.
@@ -104,6 +113,7 @@ def run(
     task : `Reconstruction()` if None
     dataset : the place that it is about, for a task that is about one
     seed : of everything random. A release whose seed is known is for measuring and protects nobody.
+    metrics : those that must be told something, such as a file, beside all that need not be
     out : a folder to keep records and reconstructions in; what it holds already is not done again
 
     Raises
@@ -111,7 +121,7 @@ def run(
     UserError
         if something is wrong with what was asked; nothing has been written then.
     """
-    plan = prepare(defenses, attacks, images, extractor=extractor, task=task, dataset=dataset, seed=seed)
+    plan = prepare(defenses, attacks, images, extractor=extractor, task=task, dataset=dataset, seed=seed, metrics=metrics)
     return in_order([plan], execute([plan], None if out is None else Path(out)))
 
 
@@ -124,6 +134,7 @@ def prepare(
     task: Task | None = None,
     dataset: Dataset | None = None,
     seed: int = 0,
+    metrics: Sequence[Metric] = (),
 ) -> Plan:
     """Check what was asked, and lay out what is to be done. Parameters as those of `run`.
 
@@ -134,7 +145,7 @@ def prepare(
     """
     task = task or Reconstruction()
     pairs = crossed(task, defenses, attacks)
-    return prepare_pairs(pairs, images, extractor=extractor, task=task, dataset=dataset, seed=seed)
+    return prepare_pairs(pairs, images, extractor=extractor, task=task, dataset=dataset, seed=seed, metrics=metrics)
 
 
 def crossed(task: Task, defenses: Sequence[Defense], attacks: Sequence[Attack] = ()) -> tuple[tuple[Defense, Attack | None], ...]:
@@ -163,6 +174,7 @@ def prepare_pairs(
     extractor: Extractor | None = None,
     dataset: Dataset | None = None,
     seed: int = 0,
+    metrics: Sequence[Metric] = (),
 ) -> Plan:
     """As `prepare`, for these pairs of a defense and an attack instead of all; None where the task judges the release itself.
 
@@ -171,7 +183,15 @@ def prepare_pairs(
     UserError
         as `prepare`.
     """
-    asked = Asked(pairs=tuple(pairs), images=images, task=task, extractor=extractor or Sift(), dataset=dataset, seed=seed)
+    asked = Asked(
+        pairs=tuple(pairs),
+        images=images,
+        task=task,
+        extractor=extractor or Sift(),
+        dataset=dataset,
+        seed=seed,
+        metrics=tuple(metrics),
+    )
     return prepared(asked)
 
 
@@ -184,6 +204,8 @@ def prepared(asked: Asked, describe: Describe = environment.describe) -> Plan:
         as `prepare`.
     """
     plan = planned(asked, describe)
+    if all(cell.reason for cell in plan.cells):
+        raise UserError("nothing to run: " + "; ".join(sorted({str(cell.reason) for cell in plan.cells})))
     Trials(plan).rehearse()
     return plan
 
@@ -194,7 +216,7 @@ def planned(asked: Asked, describe: Describe = environment.describe) -> Plan:
     Raises
     ------
     UserError
-        if something is wrong with what was asked, or no pair of it applies.
+        if something is wrong with what was asked.
     """
     task, extractor, dataset, seed = asked.task, asked.extractor, asked.dataset, asked.seed
     collection = task.collection(asked.images, dataset)
@@ -207,7 +229,7 @@ def planned(asked: Asked, describe: Describe = environment.describe) -> Plan:
         "hash": units.digest(hashes | dict(collection.beside)),
         "extractor": spec.configuration(extractor, public),
     }
-    metrics = tuple(metric() for metric in registry.everything(registry.METRIC)) if task.attacked else ()
+    metrics = (*_metrics(), *asked.metrics) if task.attacked else ()
     settings = {metric.name(): _settings(metric) for metric in metrics}
     taking_part = [plugin for pair in asked.pairs for plugin in pair if plugin is not None]
     ran = dict(describe([task, extractor, *taking_part, *metrics]))
@@ -221,14 +243,14 @@ def planned(asked: Asked, describe: Describe = environment.describe) -> Plan:
             "defense": protected,
             "attack": _attack_configuration(task, defense, attack, extractor, public, reason),
             "dataset": judged,
+            "task_settings": _settings(task),
             "metric_settings": settings,
             "seed": seed,
+            "sources": {"defense": environment.file_digest(defense), "attack": attack and environment.file_digest(attack)},
         }
         cell_id = records.cell_id(spec.written(task), head["defense"], head["attack"], judged, seed, settings)
         head |= {"cell_id": cell_id, "run_hash": records.run_hash(cell_id, ran), "environment": ran}
         cells.append(Cell(defense, attack, defense.privacy(public), head, reason))
-    if all(cell.reason for cell in cells):
-        raise UserError("nothing to run: " + "; ".join(sorted({str(cell.reason) for cell in cells})))
     unique = {cell.head["cell_id"]: cell for cell in cells}  # one that was asked for twice is done once
     return Plan(asked, task, tuple(unique.values()), collection.units, hashes, extractor, metrics, public, seed)
 
@@ -294,10 +316,17 @@ def _made(
     yield from engine(watched(iter(jobs.values())))
 
 
-def _settings(metric: Metric) -> dict[str, Any]:
-    fields = spec.written(metric)
-    del fields["name"]
-    return fields | dict(metric.parameters)
+def _metrics() -> Iterator[Metric]:
+    """All that need not be told anything."""
+    for metric in registry.everything(registry.METRIC):
+        if not fields.without_default(metric):
+            yield metric()
+
+
+def _settings(plugin: Plugin) -> dict[str, Any]:
+    settings = spec.written(plugin)
+    del settings["name"]
+    return settings | (dict(plugin.parameters) if isinstance(plugin, Metric) else {})
 
 
 def _attack_configuration(

@@ -9,7 +9,7 @@ from collections.abc import Iterable
 
 from bench.errors import UserError
 
-DONE, FAILED, MISTAKE, INTERRUPTED = 0, 1, 2, 130
+DONE, FAILED, MISTAKE, REGRESSION, INTERRUPTED = 0, 1, 2, 3, 130
 BROKEN_PIPE = 141  # as a shell reports a program that SIGPIPE ended
 PIPED_WIDTH = 400  # columns of a table that goes to a file: its cells are not folded, so that they can be searched
 

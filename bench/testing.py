@@ -18,10 +18,24 @@ from typing import Any
 import numpy as np
 
 from bench import cache, tensorfile
+from bench.datasets import photographs
 from bench.datasets.photographs import SIDE
 from bench.features import dictionary, kept
 from bench.kernels.search import unit_rows
-from bench.plugin import Asset, Attack, Defense, DescriptorAttack, Extractor, ImageAttack, Metric, Shot, Trial
+from bench.plugin import (
+    Asset,
+    Attack,
+    Dataset,
+    Defense,
+    DescriptorAttack,
+    Extractor,
+    ImageAttack,
+    Metric,
+    Outcome,
+    Shot,
+    Task,
+    Trial,
+)
 from bench.public import Public
 from bench.tasks.reconstruction import Reconstruction, view
 from bench.types import Descriptors, Features, Floats, Indices, Release, Subspaces, WordSets
@@ -141,8 +155,9 @@ def check_metric(metric: Metric, seed: int = 0) -> None:
     """A metric keeps its range, changes nothing, and prefers the truth to an estimate."""
     rng = np.random.default_rng(seed)
     if metric.compares == "images":
-        truth = rng.random((48, 40, 3), dtype=np.float32)
-        estimate = np.clip(truth + rng.normal(0, 0.1, truth.shape), 0, 1).astype(np.float32)
+        # Somebody's portrait, and noise that little is left of it under: a metric may have nothing to say of other pictures.
+        truth = (photographs.read(photographs.of_people()[0].path).pixels / 255).astype(np.float32)
+        estimate = np.clip(truth + rng.normal(0, 0.5, truth.shape), 0, 1).astype(np.float32)
     else:
         truth, estimate = example_features(30, seed).descriptors, example_features(30, seed + 1).descriptors
     before = truth.copy(), estimate.copy()
@@ -178,6 +193,57 @@ def overwrite(file: Path, kind: str) -> None:
     """Put zeros in the place of all numbers of a file of arrays, as if they were what had been written."""
     arrays, meta, _ = tensorfile.load(file, kind)
     tensorfile.save(file, kind, {name: np.zeros_like(array) for name, array in arrays.items()}, meta)
+
+
+def check_task(task: Task, defense: Defense, extractor: Extractor, secret: Features) -> None:
+    """A task without an attack gives finite numbers, each time the same, and changes nothing."""
+    assert not task.attacked, "what an attack recovers is judged by reconstruction"
+    public, before = Public(), copy.deepcopy(secret)
+    release = defense.protect(secret, public, np.random.default_rng(1))
+    released = copy.deepcopy(release)
+
+    def others(count: int) -> Iterator[Release]:
+        return (defense.protect(example_features(9, seed), public, np.random.default_rng(3)) for seed in range(count))
+
+    def judged() -> Outcome:
+        trial = Trial(
+            unit=NO_UNIT,
+            shots=(shot(secret, release),),
+            defense=defense,
+            attack=None,
+            extractor=extractor,
+            public=public,
+            metrics=(),
+            rng=np.random.default_rng(2),
+            others=others,
+            repeats=(),
+        )
+        return task.judge(trial)
+
+    first = judged()
+    assert first.metrics, "judged nothing"
+    assert all(value is None or (isinstance(value, float) and np.isfinite(value)) for value in first.metrics.values())
+    assert first.metrics == judged().metrics, "the same rng gave another outcome"
+    assert same(secret, before), "changed the secret"
+    assert same(release, released), "changed the release"
+
+
+def check_dataset(dataset: Dataset) -> None:
+    """A scene has images of different names, as large as their cameras say, the same each time, at finite poses."""
+    scene, again = dataset.scene(), dataset.scene()
+    images = (*scene.references, *scene.queries)
+    assert images, "the scene is empty"
+    assert len({image.name for image in images}) == len(images), "two images have one name"
+    for image, other in zip(images, (*again.references, *again.queries), strict=True):
+        pixels = image.pixels.read()
+        assert pixels.dtype == np.uint8
+        assert pixels.shape == (image.camera.height, image.camera.width, 3), f"{image.name}: not as large as its camera says"
+        assert image.pixels.content_hash() == other.pixels.content_hash(), f"{image.name}: another image each time"
+        assert np.array_equal(pixels, other.pixels.read()), f"{image.name}: another image each time"
+        assert image.cam_from_world is None or np.isfinite(image.cam_from_world.matrix()).all()
+        mask = image.pixels.foreground()
+        assert mask is None or mask.shape == pixels.shape[:2]
+    assert len({image.pixels.content_hash() for image in images}) == len(images), "two images have one content hash"
 
 
 def same(one: Any, other: Any) -> bool:

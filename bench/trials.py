@@ -22,7 +22,7 @@ from bench import composition, spec, units
 from bench.datasets.photographs import Source
 from bench.errors import PluginError, UnitError, UserError, blamed
 from bench.features import kept
-from bench.plugin import Attack, Defense, Outcome, Shot, Trial
+from bench.plugin import Attack, Defense, Outcome, Shot, Trial, at_once
 from bench.population import Population
 from bench.randomness import randomness
 from bench.records import EVERY_UNIT, Record
@@ -142,14 +142,26 @@ class Trials:
         """One that has that defense."""
         return next(cell for cell in self.plan.cells if cell.defense == defense)
 
-    def _judged(self, cell: Cell, unit: Unit) -> Made:
+    def trial(self, cell: Cell, unit: Unit) -> Trial:
+        """A unit of a cell, extracted and protected, before it is judged.
+
+        Raises
+        ------
+        UnitError
+            if it cannot be read, has no keypoint, or a plugin breaks.
+        """
         plan, head, attack = self.plan, cell.head, cell.attack
+        shots, content = self._shots(cell.defense, unit), plan.hashes[unit.name]
         made_with = head["defense"], head["dataset"]["extractor"]
         # Without what the task does with what was recovered: an attack that is painted by another inverter stays what it was.
         attacked = attack and spec.configuration(attack, plan.public, attack.assets(cell.defense, plan.extractor, plan.public))
-        observed, shots = self._observed(unit), self._shots(cell.defense, unit)
-        content, first = plan.hashes[unit.name], shots[0].secret
-        trial = Trial(
+        made_from = {
+            "seed": plan.seed,
+            "dataset": [head["dataset"]["hash"], self._order],
+            "unit": [unit.name, content],
+            "made with": made_with,
+        }
+        return Trial(
             unit=unit,
             shots=shots,
             defense=cell.defense,
@@ -159,20 +171,19 @@ class Trials:
             metrics=plan.metrics,
             rng=randomness("attack", plan.seed, content, *made_with, attacked),
             others=self._population(cell.defense).without(unit.name),
-            repeats=tuple(self._protect(cell, first, content, number) for number in _repetitions(attack)),
-            made_from={
-                "seed": plan.seed,
-                "dataset": [head["dataset"]["hash"], self._order],
-                "unit": [unit.name, content],
-                "made with": made_with,
-            },
+            repeats=tuple(self._protect(cell, shots[0].secret, content, number) for number in _repetitions(attack)),
+            carry_out=plan.carry_out,
+            made_from=made_from if plan.carry_out is at_once else None,  # whoever wants it done elsewhere wants it done
         )
+
+    def _judged(self, cell: Cell, unit: Unit) -> Made:
+        tried = self.trial(cell, unit)
         started = time.perf_counter()
-        with blamed(f"task {plan.task.name()}"):
-            outcome = plan.task.judge(trial)
+        with blamed(f"task {self.plan.task.name()}"):
+            outcome = self.plan.task.judge(tried)
         seconds = time.perf_counter() - started + outcome.spared
-        keypoints = max(len(shot.secret) for shot in shots)
-        notes = [note for seen in observed for note in seen.notes]
+        keypoints = max(len(shot.secret) for shot in tried.shots)
+        notes = [note for seen in self._observed(unit) for note in seen.notes]
         found = record(cell, unit, status="ok", outcome=outcome, keypoints=keypoints, notes=notes, seconds=seconds)
         return Made(record=found, picture=None if outcome.image is None else _png(outcome.image))
 
@@ -200,13 +211,13 @@ def record(
         "status": status,
         "reason": reason,
         "metrics": {} if outcome is None else {**outcome.metrics, "keypoints": keypoints},
-        "privacy": _privacy(cell, keypoints),
+        "privacy": privacy(cell, keypoints),
         "seconds": seconds,
         "notes": [*notes, *(outcome.notes if outcome else ())],
     }
 
 
-def _privacy(cell: Cell, keypoints: int | None) -> dict[str, Any]:
+def privacy(cell: Cell, keypoints: int | None) -> dict[str, Any]:
     """What the defense promises of what is released of one image, and what nothing covers."""
     epsilon, remembers = cell.privacy.epsilon, cell.defense.remembers()
     # A device that remembers answers once, however often it is asked.

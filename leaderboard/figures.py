@@ -41,10 +41,10 @@ def draw(panels: Sequence[Panel], heading: str, columns: int = COLUMNS) -> Figur
     rows = [panels[start : start + columns] for start in range(0, len(panels), columns)]
     height = 0.3 + sum(SIDE + 0.3 + LINE * max(_lines(panel) for panel in row) for row in rows)
     figure = Figure(figsize=(columns * SIDE, height), layout="constrained", dpi=120)
-    figure.suptitle(_drawable(heading), fontsize=9)
+    figure.suptitle(drawable(heading), fontsize=9)
     for axes, panel in zip(figure.subplots(len(rows), columns, squeeze=False).flat, panels, strict=False):
-        axes.set_title(_wrapped(_drawable(panel.title)), fontsize=8)
-        axes.set_xlabel(_drawable(panel.beneath), fontsize=8)
+        axes.set_title(_wrapped(drawable(panel.title)), fontsize=8)
+        axes.set_xlabel(drawable(panel.beneath), fontsize=8)
         if panel.pixels is not None:
             axes.imshow(panel.pixels)
     for axes in figure.axes:
@@ -80,6 +80,6 @@ def _wrapped(title: str) -> str:
     return "\n".join(part for line in spaced(title).split("\n") for part in textwrap.wrap(line, WRAP, break_on_hyphens=False))
 
 
-def _drawable(text: str) -> str:
-    """Matplotlib reads dollar signs as mathematics, and has no glyph for half a character."""
+def drawable(text: str) -> str:
+    """Text that is drawn as it is: matplotlib reads dollar signs as mathematics, and has no glyph for half a character."""
     return text.replace("$", r"\$").encode(errors="replace").decode()

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from PIL import Image
+
 from bench import units
 from bench.errors import UnitError
 from bench.records import Record
@@ -14,7 +16,7 @@ from leaderboard import figures, tables
 
 
 def write(records: Sequence[Record], judged: Sequence[Unit], out: Path) -> None:
-    """Write the report of `records` into the folder `out`, which keeps their reconstructions.
+    """Write the report of `records` into the folder `out`, which keeps their reconstructions and then the photographs, too.
 
     Raises
     ------
@@ -30,13 +32,21 @@ def write(records: Sequence[Record], judged: Sequence[Unit], out: Path) -> None:
             _figure(unit, of_it, out)
 
 
+def photograph(out: Path, record: Record) -> Path:
+    """Where the photograph of a record is kept, as the attacked features saw it; by content, as datasets may share names."""
+    content = record["dataset"]["hash"].removeprefix("sha256:")[:16]
+    return out / "photographs" / content / f"{record['unit']}.png"
+
+
 def _figure(unit: Unit, records: Sequence[Record], out: Path) -> None:
     try:
         original = units.read(unit.images[0])[0]
     except UnitError:
         return  # it has gone since
-    path = out / "figures" / f"{unit.name}.png"
-    path.parent.mkdir(parents=True, exist_ok=True)
+    kept, path = photograph(out, records[0]), out / "figures" / f"{unit.name}.png"
+    for folder in (kept.parent, path.parent):
+        folder.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(original).save(kept)
     shown = figures.panels(original, records, [picture(out, record) for record in records])
     # Without the software's version, the same run gives the same file.
     figures.draw(shown, f"{unit.name}. {tables.SEEDED}").savefig(path, metadata={"Software": None})

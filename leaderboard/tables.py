@@ -29,6 +29,7 @@ COMPOSED = (
     f"optimal one at δ = {DELTA:g} (Kairouz, Oh and Viswanath). Not covered: {', '.join(UNCOVERED)}."
 )
 SHOWN_FAILURES = 10
+MOST_DIGITS, LARGE = 1e4, 1e7  # numbers between these are written out
 LEFT_TO_FILES = ("MSE", "angle", "l2")  # columns that a terminal has no room for
 
 
@@ -121,10 +122,10 @@ def rendered(table: Table) -> pd.DataFrame:
     if (frame["failed"] > 0).any():
         plain["failed"] = frame["failed"].map(_count)
     for name in table.metrics:
-        plain[name.upper() if name in PAPER else name] = frame[name].map(_number)
-    plain["ε/descriptor"] = frame["epsilon_descriptor"].map(_number)
-    plain["ε/image"] = frame["epsilon_image"].map(_number)
-    plain["Pr(true)"] = frame["log10_true"].map(_chance)
+        plain[name.upper() if name in PAPER else name] = frame[name].map(number)
+    plain["ε/descriptor"] = frame["epsilon_descriptor"].map(number)
+    plain["ε/image"] = frame["epsilon_image"].map(number)
+    plain["Pr(true)"] = frame["log10_true"].map(chance)
     plain["note"] = frame["note"]
     return plain
 
@@ -174,7 +175,7 @@ def _row(cell: list[Record], defense: str, attack: str, metrics: Sequence[str]) 
         "failed": None if cell[0]["status"] == "n/a" else len(cell) - len(done),
         **{name: _mean(record["metrics"].get(name) for record in done) for name in metrics},
         "epsilon_descriptor": _float(privacy["epsilon_descriptor"]),
-        "epsilon_image": _median(_spent(record["privacy"]) for record in done),
+        "epsilon_image": _median(spent(record["privacy"]) for record in done),
         "log10_true": _float(privacy["log10_true"]),
         "note": "; ".join(_notes(cell)),
     }
@@ -191,7 +192,7 @@ def _notes(cell: list[Record]) -> list[str]:
     return [*shared, *beyond] if done else ["no photograph could be done"]
 
 
-def _spent(privacy: dict[str, Any]) -> float | None:
+def spent(privacy: dict[str, Any]) -> float | None:
     """The smaller of what the two compositions say; older records have one alone."""
     known = [float(privacy[name]) for name in ("epsilon_image", "epsilon_image_optimal") if privacy.get(name) is not None]
     return min(known, default=None)
@@ -214,7 +215,7 @@ def _label(configuration: Configuration, *, digests: bool = False) -> str:
     if configuration is None:
         return "none needed"
     shown = [
-        f"{name}={_short(value)}" for name, value in configuration.items() if name != "name" and (digests or _telling(value))
+        f"{name}={setting(value)}" for name, value in configuration.items() if name != "name" and (digests or _telling(value))
     ]
     return configuration["name"] + (":" + ",".join(shown) if shown else "")
 
@@ -228,7 +229,8 @@ def _telling(value: Any) -> bool:
     )
 
 
-def _short(value: Any) -> str:
+def setting(value: Any) -> str:
+    """The value of a field, shortened."""
     if isinstance(value, dict):
         return _label(value, digests=True)
     if isinstance(value, float):
@@ -261,11 +263,14 @@ def _count(value: Any) -> str:
     return NOT_APPLICABLE if pd.isna(value) else str(value)
 
 
-def _number(value: float) -> str:
-    return NOT_APPLICABLE if math.isnan(value) else "∞" if math.isinf(value) else f"{value:.4g}"
+def number(value: float) -> str:
+    """Four digits, and more before the point than that if it must be; a missing number is n/a."""
+    if math.isnan(value) or math.isinf(value):
+        return NOT_APPLICABLE if math.isnan(value) else "∞"
+    return f"{value:.0f}" if MOST_DIGITS <= abs(value) < LARGE else f"{value:.4g}"
 
 
-def _chance(log10: float) -> str:
+def chance(log10: float) -> str:
     """A probability from its decimal logarithm, which may be far below what a float can hold."""
     if math.isnan(log10):
         return NOT_APPLICABLE

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -56,8 +57,15 @@ def test_run_writes_everything_and_prints_the_table(bench: Bench, images: Path, 
     assert "guess attacks WordSets or Subspaces" in shown
     assert f"written to {out}" in told
     assert "\x1b" not in shown + told
-    beside = {"plan.json", "report.md", "report.csv", "figures", "reconstructions"}
-    assert {path.name for path in out.iterdir()} == {"records.jsonl", *beside}
+    assert {path.name for path in out.iterdir()} == {
+        "plan.json",
+        "records.jsonl",
+        "report.md",
+        "report.csv",
+        "figures",
+        "photographs",
+        "reconstructions",
+    }
     assert {path.name for path in (out / "figures").iterdir()} == {"0.png.png", "1.png.png"}
     assert "sift upright" in (out / "report.md").read_text()
     before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
@@ -274,4 +282,52 @@ def test_mistakes_about_datasets(bench: Bench, arguments: tuple[str, ...], compl
     assert status == 2
     assert shown == ""
     assert complaint in told
+    assert not Path("x").exists()
+
+
+def test_leaderboard_of_what_was_run(bench: Bench, images: Path, tmp_path: Path) -> None:
+    ldp = f"ldp:epsilon=12,dictionary={small_dictionary(tmp_path)}"
+    for name, defense in (("one", "none"), ("two", ldp)):
+        assert bench("run", "--defense", defense, "--attack", "painter", "--images", images, "--out", f"runs/{name}")[0] == 0
+    status, shown, told = bench("leaderboard", "--results", "runs", "--out", "site")
+    assert (status, shown) == (0, "")
+    assert told.splitlines()[-1] == "bench: written to site/index.html (boards: 1, cells: 2, records: 4)"
+    written = {path.parent.name for path in Path("site").rglob("*") if path.is_file()}
+    assert written == {"site", "tables", "plots", "pictures"}
+    assert len(list(Path("site/pictures").iterdir())) == 2 + 4  # photographs once each, and what was made of them
+    page = Path("site/index.html").read_text()
+    assert "no adapted attacker was run (dia)" in page
+    assert "bench run --defense none --attack painter --images album --seed 0" in page
+    for link in re.findall(r'(?:href|src|data-made|data-original)="([^"#:]+)"', page):
+        assert (Path("site") / link).is_file()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (("--out", "x"), "--results is missing"),
+        (("--results", "."), "--out is missing"),
+        (("--results", "absent", "--out", "x"), "absent: no such file"),
+        (("--results", ".", "--out", "x"), "there is no record in it"),
+        (("--result", ".", "--out", "x"), "unknown option '--result'; did you mean '--results'?"),
+    ],
+)
+def test_mistakes_about_leaderboards(bench: Bench, arguments: tuple[str, ...], complaint: str) -> None:
+    status, shown, told = bench("leaderboard", *arguments)
+    assert (status, shown) == (2, "")
+    assert complaint in told
+    assert told.count("\n") == 1
+    assert not Path("x").exists()
+
+
+def test_leaderboard_writes_into_a_folder_alone(bench: Bench, images: Path) -> None:
+    assert bench(*RUN, "--images", images, "--out", "runs")[0] == 0
+    status, _, told = bench("leaderboard", "--results", "runs", "--out", images / "0.png")
+    assert status == 2
+    assert "cannot write" in told
+    with Path("runs/records.jsonl").open("a") as file:
+        file.write("damaged\n")
+    status, _, told = bench("leaderboard", "--results", "runs", "--out", "x")
+    assert status == 2
+    assert "line 3: no JSON" in told
     assert not Path("x").exists()

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from skimage import metrics as reference
 
+from bench.datasets import photographs
 from bench.plugin import Metric
-from metrics import angle, l2, mae, mse, psnr, recovered, ssim
+from metrics import angle, face, l2, mae, mse, psnr, recovered, ssim
 
-IMAGES = [mae.PLUGIN, mse.PLUGIN, psnr.PLUGIN, ssim.PLUGIN]
+IMAGES = [face.PLUGIN, mae.PLUGIN, mse.PLUGIN, psnr.PLUGIN, ssim.PLUGIN]
 DESCRIPTORS = [angle.PLUGIN, l2.PLUGIN, recovered.PLUGIN]
 
 
@@ -164,6 +165,69 @@ def test_recovered_chance_level() -> None:
 # ---- what all have in common
 
 
+# ---- faces
+
+
+@pytest.fixture(scope="module")
+def portrait() -> np.ndarray:
+    """The astronaut, whose face the detector finds. (256, 256, 3) float32 in [0, 1]"""
+    (astronaut, *_) = photographs.of_people()
+    return (photographs.read(astronaut.path).pixels / 255).astype(np.float32)
+
+
+def test_a_face_is_found_again_only_where_it_was(portrait: np.ndarray) -> None:
+    found = face.PLUGIN()
+    assert found(portrait, portrait.copy()) == 1.0
+    darker = portrait * np.float32(0.8)
+    assert found(portrait, darker) == 1.0
+    elsewhere = np.roll(portrait, 60, axis=1)
+    assert found(elsewhere, elsewhere.copy()) == 1.0  # it is a face there,
+    assert found(portrait, elsewhere) == 0.0  # but not the photograph's
+    assert found(portrait, np.full_like(portrait, 0.5)) == 0.0
+
+
+def test_a_photograph_without_a_face_has_no_share(portrait: np.ndarray) -> None:
+    for source in photographs.of_grounds():
+        ground = (photographs.read(source.path).pixels / 255).astype(np.float32)
+        assert face.PLUGIN()(ground, portrait) is None
+
+
+def test_of_two_faces_one_may_be_found(portrait: np.ndarray) -> None:
+    beside = np.concatenate([portrait, portrait], axis=1)
+    covered = beside.copy()
+    covered[:, 256:] = 0.5
+    assert face.PLUGIN()(beside, covered) == 0.5
+
+
+def test_faces_are_those_of_scikit_image(portrait: np.ndarray) -> None:
+    """The detector's own answer, asked without the metric: a box around the astronaut's face, from the hair to the chin."""
+    from skimage.data import lbp_frontal_face_cascade_filename
+    from skimage.feature import Cascade
+
+    pixels = np.rint(portrait * 255).astype(np.uint8)
+    (box,) = Cascade(lbp_frontal_face_cascade_filename()).detect_multi_scale(pixels, 1.1, 1.0, (32, 32), (256, 256))
+    hidden = portrait.copy()
+    hidden[box["r"] : box["r"] + box["height"], box["c"] : box["c"] + box["width"]] = 0.5
+    assert face.PLUGIN()(portrait, hidden) == 0.0
+    others = np.full_like(portrait, 0.5)
+    rows, columns = slice(box["r"] - 12, box["r"] + box["height"] + 12), slice(box["c"] - 12, box["c"] + box["width"] + 12)
+    others[rows, columns] = portrait[rows, columns]
+    assert face.PLUGIN()(portrait, others) == 1.0
+
+
+def test_overlap_is_the_share_of_pixels_counted_one_by_one() -> None:
+    rng = np.random.default_rng(4)
+    one, other = (rng.integers((0, 0, 1, 1), (20, 20, 21, 21), (50, 4)) for _ in range(2))
+
+    def pixels(box: np.ndarray) -> set[tuple[int, int]]:
+        top, left, height, width = box
+        return {(row, column) for row in range(top, top + height) for column in range(left, left + width)}
+
+    expected = [len(pixels(a) & pixels(b)) / len(pixels(a) | pixels(b)) for a, b in zip(one, other, strict=True)]
+    np.testing.assert_allclose(face.overlap(one.astype(float), other.astype(float)), expected)
+    assert min(expected) == 0.0 < max(expected)
+
+
 @pytest.mark.parametrize("plugin", IMAGES + DESCRIPTORS)
 def test_declarations(plugin: type[Metric]) -> None:
     assert plugin.compares == ("images" if plugin in IMAGES else "descriptors")
@@ -184,8 +248,8 @@ def test_values_are_in_range_and_pure(plugin: type[Metric]) -> None:
             truth, estimate = unit(truth - 0.5), unit(estimate - 0.5)
         before = truth.copy(), estimate.copy()
         value = plugin()(truth, estimate)
-        assert isinstance(value, float)
-        assert plugin.range[0] <= value <= plugin.range[1]
+        assert value is None if plugin is face.PLUGIN else isinstance(value, float)  # noise has no face
+        assert value is None or plugin.range[0] <= value <= plugin.range[1]
         np.testing.assert_array_equal(truth, before[0])
         np.testing.assert_array_equal(estimate, before[1])
 

@@ -36,6 +36,8 @@ def test_holds_the_packages_and_the_assets_and_no_tests(wheel):
         assert f"bench/assets/{path.name}" in names
     for path in (ROOT / "leaderboard" / "reproduce" / "paper").iterdir():
         assert f"leaderboard/reproduce/paper/{path.name}" in names
+    for path in (ROOT / "leaderboard" / "site" / "page").iterdir():
+        assert f"leaderboard/site/page/{path.name}" in names
     assert wheel.name.startswith("feature_privacy_bench-")
 
 

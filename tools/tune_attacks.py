@@ -3,13 +3,15 @@
     python tools/tune_attacks.py --data ../shared/data [--attack database]
 
 Every setting of an attack's grid recovers the descriptors of the same releases: at each point of the defense, some keypoints of
-each photograph. The chosen setting has the smallest angle to the true descriptors, averaged over the points; beside it stands
-what the best setting of each point would gain. To have another attack tuned, add it to TUNINGS.
+each photograph, or all of a few where releases of others are looked at as well. The chosen setting has the smallest angle to the
+true descriptors, averaged over the points; beside it stands what the best setting of each point would gain, and where releases of
+others are looked at, the coverage that the attack believes to have. To have another attack tuned, add it to TUNINGS.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -19,18 +21,25 @@ from typing import Any
 
 import numpy as np
 
+from attacks.clustering import Clustering, candidates, chosen
 from attacks.database import Database
+from attacks.intersection import Intersection, described
 from bench import registry, spec
 from bench.datasets import photographs
+from bench.datasets.photographs import Source
 from bench.errors import UserError
 from bench.features.sift import Sift
 from bench.kernels.estimates import estimate
+from bench.kernels.meetings import meetings_within
+from bench.kernels.rebuilding import rebuilt
+from bench.kernels.sharing import Company, company
 from bench.kernels.subspaces import nearest_to_subspaces
-from bench.plugin import DescriptorAttack, Lifting, View
+from bench.plugin import DescriptorAttack, View, lifted
+from bench.population import Population
 from bench.progress import Progress
 from bench.public import Public
 from bench.tasks.reconstruction import offered
-from bench.types import Floats, Knowledge, Subspaces
+from bench.types import Floats, Knowledge
 from metrics.angle import Angle
 from metrics.recovered import Recovered
 
@@ -40,6 +49,11 @@ TITLE = """# How the attacks' settings were chosen
 Written by `tools/tune_attacks.py`, on photographs that no result is reported on and that no dictionary was made from.
 """
 METRICS = (Angle(), Recovered())
+POINTS = ("affine:dim=2", "affine:dim=4", "affine:dim=8", "affine:dim=16")
+
+
+# The estimates of one setting, and the coverage that it had of the words in the release; NaN where it looks at no other release.
+Tried = tuple[Floats, float]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,9 +62,10 @@ class Tuning:
 
     attack: type[DescriptorAttack]
     grid: Mapping[str, Sequence[Any]]
-    points: Sequence[str]
-    # The estimates of all settings from one view, which share what work they can.
-    recover: Callable[[View, Sequence[Any]], Iterator[Floats]]
+    photographs: int  # of tune.txt
+    keypoints: int | None  # of each, or all
+    # What all settings make of one view. They share what work they can.
+    recover: Callable[[View, Sequence[Any]], Iterator[Tried]]
 
     @property
     def settings(self) -> dict[str, DescriptorAttack]:
@@ -63,25 +78,75 @@ class Tuning:
         return made
 
 
-def recover_by_database(seen: View, settings: Sequence[Database]) -> Iterator[Floats]:
+def recover_by_database(seen: View, settings: Sequence[Database]) -> Iterator[Tried]:
     """One search for all: fewer neighbours are the first of many."""
-    release, defense = seen.release, seen.defense
-    assert isinstance(release, Subspaces)
-    assert isinstance(defense, Lifting)
-    words, adversarial = seen.know(Knowledge.DATABASE).words, defense.adversarial
+    release, adversarial = lifted(seen)
+    words = seen.know(Knowledge.DATABASE).words
     most = max(attack.neighbours for attack in settings)
     found, distances = nearest_to_subspaces(release, words, adversarial + most)
     for attack in settings:
         few = slice(adversarial + attack.neighbours)
-        yield estimate(release, words, found[:, few], distances[:, few], adversarial, attack.estimators)
+        yield estimate(release, words, found[:, few], distances[:, few], adversarial, attack.estimators), np.nan
+
+
+def recover_by_clustering(seen: View, settings: Sequence[Clustering]) -> Iterator[Tried]:
+    """One search, one clustering for each |V|, and one company for each c."""
+    release, adversarial = lifted(seen)
+    z = seen.know(Knowledge.PUBLIC_DATABASE).words
+    found, distances = nearest_to_subspaces(release, z, max(attack.neighbours for attack in settings))
+
+    @functools.cache
+    def of(neighbours: int) -> Any:
+        return candidates(release, z, found[:, :neighbours], distances[:, :neighbours], adversarial + 1)
+
+    shared = companies(seen)
+    for attack in settings:
+        kept = shared(attack.others, attack.coverage)
+        yield chosen(of(attack.neighbours), kept), kept.coverage
+
+
+def recover_by_intersection(seen: View, settings: Sequence[Intersection]) -> Iterator[Tried]:
+    """One company and one rebuilt database for each c."""
+    release, adversarial = lifted(seen)
+    shared = companies(seen)
+
+    @functools.cache
+    def words(others: int, coverage: float) -> Any:
+        return rebuilt(meetings_within(shared(others, coverage).subspaces))
+
+    for attack in settings:
+        asked = attack.others, attack.coverage
+        yield described(release, words(*asked), adversarial, attack.neighbours, attack.estimators), shared(*asked).coverage
+
+
+def companies(seen: View) -> Callable[[int, float], Company]:
+    """From c and the share that is enough to the company of the release, each found once."""
+    release, adversarial = lifted(seen)
+    others = seen.know(Knowledge.OTHER_RELEASES)
+    return functools.cache(lambda count, enough: company(release, others(count), adversarial, enough))
 
 
 TUNINGS = (
     Tuning(
         attack=Database,
         grid={"neighbours": (10, 100, 1000, 2000, 4000, 8000), "estimators": (1, 2, 3, 5, 10)},
-        points=("affine:dim=2", "affine:dim=4", "affine:dim=8", "affine:dim=16"),
+        photographs=100,
+        keypoints=15,
         recover=recover_by_database,
+    ),
+    Tuning(
+        attack=Clustering,
+        grid={"neighbours": (64, 128, 256, 512, 1024), "others": (100, 200, 400, 800)},
+        photographs=8,
+        keypoints=None,
+        recover=recover_by_clustering,
+    ),
+    Tuning(
+        attack=Intersection,
+        grid={"neighbours": (512, 1024, 2048, 4096), "estimators": (1, 2, 4, 8)},
+        photographs=4,
+        keypoints=None,
+        recover=recover_by_intersection,
     ),
 )
 
@@ -91,71 +156,82 @@ def main() -> None:
     names = [tuning.attack.name() for tuning in TUNINGS]
     parser.add_argument("--data", type=Path, required=True, help="the folder of tune.txt and train/")
     parser.add_argument("--attack", choices=names, action="append", help="one to tune, may be repeated; all by default")
-    parser.add_argument("--keypoints", type=int, default=15, help="of each photograph")
     args = parser.parse_args()
-    photos = [args.data / "train" / name for name in (args.data / "tune.txt").read_text().split()]
+    sources = [Source(name, args.data / "train" / name) for name in (args.data / "tune.txt").read_text().split()]
     for tuning in TUNINGS:
         if tuning.attack.name() in (args.attack or names):
-            measured = measure(tuning, photos, args.keypoints)  # (points, settings, photographs, metrics)
-            section = report(tuning, measured, args.keypoints)
+            section = report(tuning, measure(tuning, sources))
             print(section)
             write(tuning.attack.name(), section)
 
 
-def measure(tuning: Tuning, photos: Sequence[Path], keypoints: int) -> np.ndarray:
-    """Angle and share recovered. -> (points, settings, photographs, 2)"""
+def measure(tuning: Tuning, sources: Sequence[Source]) -> np.ndarray:
+    """Angle, share recovered, and coverage. -> (points, settings, photographs, 3)"""
     public, extractor = Public(), Sift()
-    defenses = [spec.read(point, registry.DEFENSE) for point in tuning.points]
+    defenses = [spec.read(point, registry.DEFENSE) for point in POINTS]
+    populations = [
+        Population(sources, extractor, defense, public, functools.partial(drawn, point)) for point, defense in enumerate(defenses)
+    ]
     settings = list(tuning.settings.values())
-    values = np.empty((len(defenses), len(settings), len(photos), len(METRICS)))
-    with Progress(tuning.attack.name(), len(photos)) as progress:
-        for number, path in enumerate(photos):
-            secret = extractor.extract(photographs.read(path).pixels, path)
+    chosen_sources = sources[: tuning.photographs]
+    values = np.empty((len(defenses), len(settings), len(chosen_sources), len(METRICS) + 1))
+    with Progress(tuning.attack.name(), len(chosen_sources) * len(defenses)) as progress:
+        for number, source in enumerate(chosen_sources):
+            secret = extractor.extract(photographs.read(source.path).pixels, source.path)
             rng = np.random.default_rng(number)
-            secret = secret.take(np.sort(rng.choice(len(secret), min(keypoints, len(secret)), replace=False)))
+            if tuning.keypoints is not None:
+                secret = secret.take(np.sort(rng.choice(len(secret), min(tuning.keypoints, len(secret)), replace=False)))
             for point, defense in enumerate(defenses):
                 release = defense.protect(secret, public, np.random.default_rng([number, point]))
-                known = offered(settings[0], defense, public)
+                others = populations[point].without(source.name)
+                known = offered(settings[0], defense, public) | {Knowledge.OTHER_RELEASES: lambda others=others: others}
                 seen = View(release=release, defense=defense, extractor=extractor, knowledge=known)
-                for setting, found in enumerate(tuning.recover(seen, settings)):
-                    values[point, setting, number] = [metric(secret.descriptors, found) for metric in METRICS]
-            progress.advance()
+                for setting, (found, coverage) in enumerate(tuning.recover(seen, settings)):
+                    values[point, setting, number] = [*(metric(secret.descriptors, found) for metric in METRICS), coverage]
+                progress.advance()
     return values
 
 
-def report(tuning: Tuning, measured: np.ndarray, keypoints: int) -> str:
-    """A section of docs/tuning.md. (points, settings, photographs, 2)"""
+def drawn(point: int, *parts: object) -> np.random.Generator:
+    """A generator for each release of the population of one point."""
+    return np.random.default_rng([point, *str(parts).encode()])
+
+
+def report(tuning: Tuning, measured: np.ndarray) -> str:
+    """A section of docs/tuning.md. (points, settings, photographs, 3)"""
     angles = measured[..., 0].mean(axis=2)  # (points, settings)
     settings = list(tuning.settings)
-    chosen = int(angles.mean(axis=0).argmin())
+    best = int(angles.mean(axis=0).argmin())
+    keypoints = "all keypoints" if tuning.keypoints is None else f"{tuning.keypoints} keypoints"
+    covered = "" if np.isnan(measured[..., 2]).all() else ", and the coverage of the adversarial words by the attack's own count"
     lines = [
-        f"`python tools/tune_attacks.py --data DATA --attack {tuning.attack.name()} --keypoints {keypoints}`: "
-        f"{measured.shape[2]} photographs, {keypoints} keypoints of each, upright SIFT.",
+        f"`python tools/tune_attacks.py --data DATA --attack {tuning.attack.name()}`: {measured.shape[2]} photographs, "
+        f"{keypoints} of each, upright SIFT.",
         "",
-        f"Chosen, by the mean over the points: `{settings[chosen]}`. Cells: mean angle in degrees, and the share recovered among "
-        f"the {keypoints}. What is lost: degrees, with the standard error over photographs.",
+        f"Chosen, by the mean over the points: `{settings[best]}`. Cells: mean angle in degrees, the share recovered among "
+        f"these keypoints{covered}. What is lost: degrees, with the standard error over photographs.",
         "",
         "| point | chosen | best there | which is | lost |",
         "| --- | --- | --- | --- | --- |",
     ]
-    for point, values in zip(tuning.points, measured, strict=True):
-        best = int(values[..., 0].mean(axis=1).argmin())
-        lost = values[chosen, :, 0] - values[best, :, 0]  # (photographs,)
+    for point, values in zip(POINTS, measured, strict=True):
+        there = int(values[..., 0].mean(axis=1).argmin())
+        lost = values[best, :, 0] - values[there, :, 0]  # (photographs,)
         error = lost.std(ddof=1) / len(lost) ** 0.5
         lines.append(
-            row(f"`{point}`", cell(values[chosen]), cell(values[best]), settings[best], f"{lost.mean():.2f} ± {error:.2f}")
+            row(f"`{point}`", cell(values[best]), cell(values[there]), settings[there], f"{lost.mean():.2f} ± {error:.2f}")
         )
-    lines += ["", row("setting", *(f"`{point}`" for point in tuning.points), "mean angle")]
-    lines.append(row(*["---"] * (len(tuning.points) + 2)))
+    lines += ["", row("setting", *(f"`{point}`" for point in POINTS), "mean angle")]
+    lines.append(row(*["---"] * (len(POINTS) + 2)))
     for number, name in enumerate(settings):
         lines.append(row(name, *(cell(values[number]) for values in measured), f"{angles[:, number].mean():.2f}"))
     return "\n".join(lines) + "\n"
 
 
 def cell(values: np.ndarray) -> str:
-    """(photographs, 2)"""
-    angle, share = values.mean(axis=0)
-    return f"{angle:.2f}° {share:.3f}"
+    """(photographs, 3)"""
+    angle, share, coverage = values.mean(axis=0)
+    return f"{angle:.2f}° {share:.3f}" + ("" if np.isnan(coverage) else f", {coverage:.2f}")
 
 
 def row(*cells: str) -> str:

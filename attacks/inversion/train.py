@@ -20,6 +20,7 @@ from torch import Tensor
 from attacks.inversion import weights
 from attacks.inversion.data import Example, Examples, Served, fitting_dictionaries, quantisation_error, quantise
 from attacks.inversion.encoding import Encoding, Points, encode, stack
+from attacks.inversion.log import Log
 from attacks.inversion.loss import reconstruction_loss, ssim
 from attacks.inversion.network import Inverter, Shape, paint
 from bench import tensorfile
@@ -68,6 +69,7 @@ def train(
     encoding: Encoding = "invariant",
     widths: tuple[int, ...] = Shape.widths,
     training: Training = Training(),  # frozen
+    log: Path | None = None,
 ) -> dict[str, Any]:
     """Train, or resume, a network for the releases of `defense`, and return its metadata. What is done is not done again.
 
@@ -81,12 +83,15 @@ def train(
     start : weights of a network for raw descriptors to start from; random ones if None
     encoding : what the network is told of a keypoint
     widths : of the network's levels
+    log : folder for TensorBoard: loss, rate and speed of each step, and the validation's scores
 
     Raises
     ------
     UserError
-        if photographs are in both sets, no photograph can be used, or `out` or its checkpoint is of another training.
+        if photographs are in both sets, no photograph can be used, or `out` or its checkpoint is of another training; or
+        there is to be a log, and tensorboard is not installed.
     """
+    written = Log(log)
     shared = {source.content_hash() for source in photographs} & {source.content_hash() for source in validation}
     if shared:
         raise UserError(f"{len(shared)} photographs are in both the training and the validation set")
@@ -113,12 +118,14 @@ def train(
         done = weights.load(out).meta
         _same_training(out, done, meta)
         return done
-    trainer = _Trainer(shape, training, out, meta)
+    trainer = _Trainer(shape, training, out, meta, written)
     if start is not None and trainer.step == 0:
         read_as_descriptors = slots if defense.releases is WordSets and not one_by_one else 1
         trainer.start_from(weights.load(start).module, read_as_descriptors)
     module = trainer.run(examples)
     meta["validation"] = validate(module, held_out, unseen[:VALIDATE_AT_MOST], slots, encoding)
+    written.scalars({f"validation/{name}": value for name, value in meta["validation"].items()}, training.steps)
+    written.close()
     weights.save(out, module, shape, meta)
     _checkpoint_path(out).unlink(missing_ok=True)
     return meta
@@ -192,9 +199,9 @@ def _checkpoint_path(out: Path) -> Path:
 class _Trainer:
     """Weights, their moving average, AdamW's state and the number of steps done: what a checkpoint holds."""
 
-    def __init__(self, shape: Shape, training: Training, out: Path, meta: dict[str, Any]) -> None:
+    def __init__(self, shape: Shape, training: Training, out: Path, meta: dict[str, Any], log: Log) -> None:
         torch.manual_seed(training.seed)
-        self.training, self.meta = training, meta
+        self.training, self.meta, self.log = training, meta, log
         self.device = pick_device()
         self.dtype = pick_dtype(self.device)
         self.path = _checkpoint_path(out)
@@ -220,6 +227,7 @@ class _Trainer:
                 loss = self._advance(points.to(self.device), photographs.to(self.device))
                 smooth = loss if math.isnan(smooth) else 0.98 * smooth + 0.02 * loss
                 speed = (self.step - before) * self.training.batch / (time.monotonic() - started)
+                self.log.scalars({"loss": loss, "rate": self.optimizer.param_groups[0]["lr"], "images/s": speed}, self.step)
                 progress.advance(1, f"loss {smooth:.4f}, {speed:.1f} images/s")
                 if self.step % CHECKPOINT_EVERY == 0:
                     self._save()

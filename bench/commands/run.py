@@ -11,7 +11,7 @@ from bench.errors import UserError
 from bench.terminal import DONE, FAILED, add_engine, add_extractor, add_seed, say
 
 if TYPE_CHECKING:
-    from bench.plugin import Defense, Task
+    from bench.plugin import Defense, Metric, Task
     from bench.records import Record
     from bench.runner import Plan
 
@@ -31,6 +31,13 @@ def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--attack", action="append", metavar="SPEC", help="who tries to undo it; may be repeated")
     parser.add_argument(
         "--task", metavar="SPEC", default="reconstruction", help="what a release is judged by (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--metric",
+        action="append",
+        default=[],
+        metavar="SPEC",
+        help="one that must be told a file; all others are measured anyway",
     )
     add_extractor(parser)
     parser.add_argument("--images", type=Path, metavar="DIR", help="a folder of photographs (default: seven built-in ones)")
@@ -62,6 +69,7 @@ def execute(args: argparse.Namespace) -> int:
         extractor=spec.read(args.extractor, registry.EXTRACTOR),
         dataset=None if args.dataset is None else spec.read(args.dataset, registry.DATASET),
         seed=args.seed,
+        metrics=tuple(_metric(text) for text in args.metric),
     )
     plan = runner.prepared(asked, engine.describe)
     out = args.out or Path("runs") / _run_name(plan)
@@ -82,6 +90,15 @@ def _defense(text: str, task: Task) -> Defense:
     if task.places and plugin.quantised_by is not None:
         given.setdefault(plugin.quantised_by, Asset(REFERENCES))
     return spec.build(plugin, given)
+
+
+def _metric(text: str) -> Metric:
+    from bench import fields, registry, spec
+
+    metric = spec.read(text, registry.METRIC)
+    if not fields.without_default(type(metric)):
+        raise UserError(f"--metric {metric.name()}: it needs not be asked for; all metrics that need no file are measured")
+    return metric
 
 
 def _check_attacks(task: Task, attacks: list[str] | None) -> None:

@@ -40,6 +40,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--rate", type=float, metavar="R", help="the learning rate at its peak")
     parser.add_argument("--steps", type=whole, metavar="N", help="steps of training")
     parser.add_argument("--batch", type=whole, metavar="N", help="photographs a step")
+    parser.add_argument("--log", type=Path, metavar="DIR", help="writes loss, rate and speed for TensorBoard")
     add_seed(parser, "the training")
     add_extractor(parser)
 
@@ -70,7 +71,7 @@ def execute(args: argparse.Namespace) -> int:
     key = kept.key(defense, served, **asked)
     meta = kept.fetch(key, args.out)
     if meta is None:
-        meta = train(defense, served, out=args.out, **asked)
+        meta = train(defense, served, out=args.out, log=args.log, **asked)
         kept.keep(key, args.out)
     scores = ", ".join(f"{name} {value:.4g}" for name, value in meta["validation"].items())
     print(f"{args.out}: {meta['crops']} crops of {meta['photographs']} photographs; validation: {scores}")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,7 +20,8 @@ from bench.types import Bytes
 
 SIDE = 256  # pixels
 SMALLEST = 32  # pixels; less cannot be called a photograph
-SUFFIXES = {".jpg", ".jpeg", ".png", ".webp"}
+MEGADEPTH = re.compile(r"dense\d+")  # the folder of a reconstruction, which has one called imgs
+SUFFIXES = {".jpg", ".jpeg", ".png", ".ppm", ".webp"}
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,10 @@ class Photograph:
 
 
 def folder(directory: Path) -> list[Source]:
-    """The JPEG, PNG and WebP files of a folder and its subfolders, by name.
+    """The JPEG, PNG, PPM and WebP files of a folder and its subfolders, by name.
+
+    Of MegaDepth (Li and Snavely, CVPR 2018), those in `dense*/imgs`; other pictures lie beside them. Of HPatches (Balntas et al.,
+    CVPR 2017), all six of each sequence.
 
     Raises
     ------
@@ -52,6 +57,7 @@ def folder(directory: Path) -> list[Source]:
     if not directory.is_dir():
         raise UserError(f"--images {directory}: no such folder")
     files = sorted(path for path in directory.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file())
+    files = [path for path in files if path.parent.name == "imgs" and MEGADEPTH.fullmatch(path.parents[1].name)] or files
     if not files:
         raise UserError(f"--images {directory}: no photograph in it (looked for {', '.join(sorted(SUFFIXES))})")
     return [Source(path.relative_to(directory).as_posix(), path) for path in files]

@@ -5,14 +5,17 @@ from __future__ import annotations
 import multiprocessing
 import signal
 from collections.abc import Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from bench import environment, threads
 from bench.engines import Engine, Job, first_come, letter, worker
 from bench.errors import UserError
 from bench.trials import Made
+
+if TYPE_CHECKING:
+    from bench.runner import Plan
 
 AHEAD = 2  # jobs for each process: one that it does, and one that lies ready
 
@@ -33,11 +36,17 @@ class Processes(Engine):
     def __call__(self, jobs: Iterator[Job]) -> Iterator[Made]:
         # Processes are started afresh: a copy of one that has computed with several threads can hang.
         executor = ProcessPoolExecutor(self._workers, multiprocessing.get_context("spawn"), initializer=_begin)
+        plans: set[Plan] = set()
+
+        def submit(job: Job) -> Future[Made]:
+            place = job.plan.public.place
+            if place is not None and job.plan.needs_map and job.plan not in plans:
+                _ = place.map  # made once, before each process reads it
+            plans.add(job.plan)
+            return executor.submit(worker.carry_out, letter(job, self._threads))
+
         try:
-            submitted = first_come(
-                lambda job: executor.submit(worker.carry_out, letter(job, self._threads)), lambda: AHEAD * self._workers, jobs
-            )
-            for _, future in submitted:
+            for _, future in first_come(submit, lambda: AHEAD * self._workers, jobs):
                 yield future.result()
         except BrokenProcessPool:
             raise UserError("a worker process was ended from outside, perhaps for want of memory; run again to go on") from None

@@ -9,18 +9,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
-from PIL import Image
 
 from bench.errors import UnitError, UserError
+from bench.features.stored import in_square, named, upright
 from bench.kernels.search import unit_rows
 from bench.plugin import Extractor
 from bench.types import Features, Floats
-
-ORIENTATION = 0x0112  # the EXIF tag; 1 is upright
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +54,8 @@ class Hloc(Extractor):
     def _read(self, source: Path) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
         """-> keypoints (N, 2), descriptors (D, N), and the width and height that they were extracted at"""
         with h5py.File(self.path) as opened:
-            group = _group(opened, source)
+            name = named(source, opened)
+            group = None if name is None else opened[name]
             if group is None:
                 raise UnitError(f"{source.name}: {self.path} has no features of it")
             missing = [name for name in ("keypoints", "descriptors", "image_size") if name not in group]
@@ -70,24 +68,6 @@ class Hloc(Extractor):
         return keypoints.astype(np.float64), descriptors, (width, height)
 
 
-def in_square(xy: np.ndarray, size: tuple[int, int], side: int) -> np.ndarray:
-    """Move points of an image of `size` (width, height) into its largest centred square, resized to `side`. (N, 2) -> (N, 2)"""
-    width, height = size
-    short = min(size)
-    corner = np.array([(width - short) // 2, (height - short) // 2])  # as photographs.square cuts
-    return (xy - corner) * (side / short)
-
-
-def _group(opened: Any, source: Path) -> Any:
-    """The group whose name is the longest end of the photograph's path."""
-    parts = source.resolve().parts[1:]
-    for start in range(len(parts)):
-        name = "/".join(parts[start:])
-        if name in opened:
-            return opened[name]
-    return None
-
-
 def _check(source: Path, descriptors: Floats, count: int, dimension: int, size: tuple[int, int]) -> None:
     if count == 0:
         raise UnitError(f"{source.name}: no keypoint")
@@ -97,11 +77,7 @@ def _check(source: Path, descriptors: Floats, count: int, dimension: int, size: 
         raise UnitError(f"{source.name}: descriptors hold values that are not finite")
     if not descriptors.any(axis=0).all():
         raise UnitError(f"{source.name}: a descriptor is zero")
-    with Image.open(source) as opened:
-        if opened.size != size:
-            raise UnitError(f"{source.name}: the features are of an image of {size} pixels, the photograph has {opened.size}")
-        if opened.getexif().get(ORIENTATION, 1) != 1:
-            raise UnitError(f"{source.name}: it has an EXIF rotation, which hloc's features do not follow")
+    upright(source, size)
 
 
 PLUGIN = Hloc

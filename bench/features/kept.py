@@ -6,19 +6,27 @@ Both are the owner's secrets, as the photographs are. Only the runner keeps them
 from __future__ import annotations
 
 import hashlib
+import itertools
+import multiprocessing
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from typing import Any
 
 import numpy as np
+import torch
 
-from bench import cache, environment, provenance, spec
+from bench import cache, environment, provenance, spec, threads
 from bench.datasets.scene import Pixels
 from bench.features import dictionary
 from bench.features.dictionary import Dictionary
 from bench.plugin import Extractor
+from bench.progress import Progress
 from bench.tensorfile import Arrays
 from bench.types import Bytes, Features, Floats, Indices
 
 KIND = "features"
 WORDS = "words"
+FEW = 16  # images that are not worth processes of their own
 
 
 def features(extractor: Extractor, pixels: Pixels) -> Features:
@@ -34,14 +42,40 @@ def features(extractor: Extractor, pixels: Pixels) -> Features:
         found = extractor.extract(pixels.read(), getattr(pixels, "path", None))
         return to_arrays(found), {"size": list(found.size)}
 
-    key = {
+    arrays, meta = cache.fetch(KIND, _key(extractor, pixels), make)
+    return from_arrays(arrays, tuple(meta["size"]))
+
+
+def all_features(extractor: Extractor, images: Sequence[Pixels]) -> Iterator[Features]:
+    """The features of images; where many are not kept yet, as many processes extract them as this one may use threads.
+
+    Raises
+    ------
+    UnitError
+        if one of them cannot be read.
+    """
+    missing = [image for image in images if not cache.path(KIND, _key(extractor, image)).is_file()]
+    processes = torch.get_num_threads()
+    if len(missing) > FEW and processes > 1:
+        executor = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), threads.limit, (1,))
+        with executor, Progress("features of reference images", len(missing)) as progress:
+            for _ in executor.map(_keep, itertools.repeat(extractor), missing):
+                progress.advance()
+    return (features(extractor, image) for image in images)
+
+
+def _keep(extractor: Extractor, pixels: Pixels) -> None:
+    """As `features`, for a process that keeps them for others."""
+    features(extractor, pixels)
+
+
+def _key(extractor: Extractor, pixels: Pixels) -> dict[str, Any]:
+    return {
         "image": pixels.content_hash(),
         "extractor": spec.written(extractor),
         "source": provenance.source(type(extractor).__module__),
         "libraries": environment.libraries(),
     }
-    arrays, meta = cache.fetch(KIND, key, make)
-    return from_arrays(arrays, tuple(meta["size"]))
 
 
 def nearest_words(known: Dictionary, rows: Bytes | Floats) -> Indices:

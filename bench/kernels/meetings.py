@@ -136,7 +136,7 @@ def _squared_distances(mine: Tensor, theirs: Tensor) -> Tensor:
     form = torch.zeros(other + 1, *products.shape[1:], device=mine.device)  # (b + 1, b + 1, n, n')
     form.diagonal().fill_(1)  # (n, n', b + 1), of the first two axes
     form[other, :other] = -products[dim, :other]
-    form[other, other] = mine[dim].square().sum(dim=1)[:, None] + theirs[dim].square().sum(dim=1) - 2 * products[dim, other]
+    form[other, other] = mine[dim].square().sum(dim=1)[:, None] + theirs[other].square().sum(dim=1) - 2 * products[dim, other]
     for inner in products[:dim]:  # (b + 1, n, n')
         form.addcmul_(inner[:, None], inner[None], value=-1)
     for step in range(other):

@@ -79,7 +79,8 @@ def reprojection(pose: pycolmap.Rigid3d, camera: pycolmap.Camera, xy: Doubles, x
     before = seen[:, 2] > 0
     apart = np.full(len(xy), np.inf)
     apart[before] = np.linalg.norm(np.asarray(camera.img_from_cam(seen[before])) - xy[before], axis=1)
-    return np.nan_to_num(apart, nan=np.inf)
+    apart[np.isnan(apart)] = np.inf  # what a lens does not map
+    return apart
 
 
 def misfit(xy: Doubles, xyz: Doubles, camera: pycolmap.Camera, found: Estimate) -> float | None:

@@ -64,12 +64,13 @@ class Intersections(Task):
         defense = trial.defense
         if not isinstance(defense, Lifting):
             raise UnitError("intersections needs subspaces through words of a database")
-        words = unit_rows(trial.public.dictionary(fields.asset_fields(defense)["database"]).words)  # (K, D)
+        codes = trial.public.dictionary(fields.asset_fields(defense)["database"]).words  # (K, D)
+        words = unit_rows(codes)
         count = self.subspaces or len(trial.secret)
         alone, among = [], []
         for secret in rounds(trial.secret, count, trial.rng):
             lifted = defense.lifted(secret, trial.public, trial.rng)
-            near, _ = nearest_to_subspaces(lifted.release, words, max(COUNTS) + defense.adversarial)  # (n, N + a)
+            near, _ = nearest_to_subspaces(lifted.release, codes, max(COUNTS) + defense.adversarial)  # (n, N + a)
             for rows in np.array_split(np.arange(len(near)), -(-len(near) // BATCH)):
                 points = np.concatenate([secret.descriptors[rows, None], words[lifted.words[rows]]], axis=1)  # (b, 1 + a, D)
                 match = matches(words[near[rows]], points, self.ratio)  # (b, N + a)

@@ -80,7 +80,7 @@ class Reconstruction(Task):
         if attack is None:
             raise UnitError("reconstruction needs an attack")
         if isinstance(attack, ImageAttack):
-            return compared(trial, None, reconstructed(attack, view(trial), trial.rng))
+            return compared(trial, None, reconstructed(attack, view(trial), trial))
         found = recovery.recovered(attack, trial, view(trial))
         inverter, undefended, reason = self._inverter(trial.extractor, trial.public)
         if reason is not None:
@@ -89,7 +89,7 @@ class Reconstruction(Task):
         keypoints = trial.release.keypoints[found.selection.rows]
         release = Descriptors(keypoints=keypoints, size=trial.release.size, descriptors=found.selection.descriptors)
         seen = view(dataclasses.replace(trial.released(release), attack=inverter, defense=undefended))
-        outcome = compared(trial, found.selection, reconstructed(inverter, seen, trial.rng), found.notes)
+        outcome = compared(trial, found.selection, reconstructed(inverter, seen, trial), found.notes)
         return dataclasses.replace(outcome, spared=found.spared)
 
     def _inverter(self, extractor: Extractor, public: Public) -> tuple[ImageAttack, Defense, str | None]:
@@ -139,10 +139,10 @@ def _served(trial: Trial) -> Any:
     return Server(public=trial.public, camera=trial.unit.subject.camera)
 
 
-def reconstructed(attack: ImageAttack, seen: View, rng: np.random.Generator) -> Floats:
+def reconstructed(attack: ImageAttack, seen: View, trial: Trial) -> Floats:
     """The attacker's image. -> (H, W, 3)"""
     with blamed(f"plugin {attack.name()}"):
-        image = attack.reconstruct(seen, rng)
+        image: Floats = trial.carry_out(attack.reconstruct, seen, trial.rng)
         width, height = seen.release.size
         recovery.expect(image, (height, width, 3))
         if image.min() < 0 or image.max() > 1:

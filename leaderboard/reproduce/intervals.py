@@ -18,7 +18,7 @@ SEED = 0  # samples of one size are resampled alike, so that intervals of one ta
 
 @dataclass(frozen=True)
 class Interval:
-    """A mean, and where it would lie for other photographs of the kind with 95% confidence."""
+    """A mean, and where it would lie for other photographs of the kind with 95% confidence, if no other is asked for."""
 
     mean: float
     low: float
@@ -26,7 +26,7 @@ class Interval:
     count: int  # units, such as photographs
 
 
-def interval(values: ArrayLike) -> Interval:
+def interval(values: ArrayLike, level: float = LEVEL) -> Interval:
     """The mean of (n,) values, one a photograph, n at least 1, with its bootstrap interval; of a single one it has no ends.
 
     For a paired comparison, hand over the differences.
@@ -36,7 +36,7 @@ def interval(values: ArrayLike) -> Interval:
         return Interval(float(sample[0]), -math.inf, math.inf, 1)
     drawn = np.random.default_rng(SEED).integers(len(sample), size=(RESAMPLES, len(sample)))
     means = sample[drawn].mean(axis=1)  # (RESAMPLES,)
-    low, high = np.quantile(means, ((1 - LEVEL) / 2, (1 + LEVEL) / 2))
+    low, high = np.quantile(means, ((1 - level) / 2, (1 + level) / 2))
     return Interval(float(sample.mean()), float(low), float(high), len(sample))
 
 

@@ -51,7 +51,7 @@ CPU = Profile(
     subspaces=20_000,
     others=1600,
     place=Gallery(),
-    place_scale=1 / 16,
+    place_scale=1 / 32,
     trials=0.003,
 )
 PAPER = Profile(

@@ -1,0 +1,59 @@
+"""Matches whose neighbours move alike: how true ones are found among many that are due to chance.
+
+Where sets of words are released, most matches of two images are accidents: with N keypoints of m words each, of |K| words, some
+
+    |K| (λ e^-λ)²,    λ = N m / |K|,
+
+words are unique in both images by chance. They scatter; true matches lie in a field of displacements that changes little from
+one place to the next. So the support of a match is counted, as the matches nearby that are displaced like it (grid-based motion
+statistics: Bian et al., CVPR 2017), and the half that has least of it is dropped, again and again: chance fades as their number
+does, and the support that true matches give each other stays.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from bench.types import Indices
+
+Doubles = NDArray[np.float64]
+
+NEAR = 0.1  # half the side of the neighbourhood, as a share of the image's longer side
+ALIKE = 0.025  # of the displacement, likewise
+TELLING = 0.05  # chance of what counts as more support than chance gives
+CLEAN = 0.8  # share of matches with such support at which no more are dropped
+
+
+def support(first: Doubles, second: Doubles, near: float, alike: float) -> Indices:
+    """For each match the number of other matches near it that are displaced alike. (M, 2), (M, 2) pixels -> (M,)
+
+    Parameters
+    ----------
+    near, alike : how far apart two positions in the first image, and two displacements, may be along each axis, in pixels
+    """
+    places = np.concatenate([first / near, (second - first) / alike], axis=1)  # (M, 4)
+    return np.asarray(cKDTree(places).query_ball_point(places, 1.0, p=np.inf, return_length=True), np.int64) - 1
+
+
+def consistent(first: Doubles, second: Doubles, longer: float, fewest: int, rng: np.random.Generator) -> Indices:
+    """Rows of the matches that support each other, ascending. (M, 2), (M, 2) pixels -> (M',)
+
+    Stops when half of what is left has more support than all but one in twenty of as many matches between the same positions
+    that are shuffled, or when `fewest` are left.
+
+    Parameters
+    ----------
+    longer : of the image's sides, in pixels
+    """
+    left = np.arange(len(first))
+    near, alike = NEAR * longer, ALIKE * longer
+    while len(left) > fewest:
+        a, b = first[left], second[left]
+        found, chance = support(a, b, near, alike), support(a, rng.permutation(b), near, alike)
+        if (found > np.quantile(chance, 1 - TELLING)).mean() >= CLEAN:
+            break
+        kept = np.argsort(-found, kind="stable")[: max(fewest, len(left) // 2)]
+        left = left[np.sort(kept)]
+    return left

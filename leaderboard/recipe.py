@@ -1,0 +1,122 @@
+"""The command that makes a cell again, from its records."""
+
+from __future__ import annotations
+
+import functools
+import shlex
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from bench import fields, registry
+from bench.errors import UserError
+from bench.plugin import Plugin
+from bench.public import ASSETS, SHIPPED
+from bench.records import Record
+from bench.registry import Kind
+from leaderboard.boards import Cell
+
+BUILTIN = "builtin"  # the photographs that need no --images
+Lookup = Callable[[Kind, str], type[Plugin] | None]
+HERE = "reconstruction", "dia"  # the default task, and what paints the descriptors there
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """A line for a shell, and what it takes beside this program."""
+
+    command: str
+    needs: tuple[str, ...]
+
+
+def installed(kind: Kind, name: str) -> type[Plugin] | None:
+    """The plugin of that name, if it is here."""
+    try:
+        found: type[Plugin] = registry.lookup(kind, name)
+    except UserError:
+        return None
+    return found
+
+
+def recipe(cell: Cell, lookup: Lookup = installed) -> Recipe:
+    """`bench run` with all that the records say; files of the user's own stand there as FILE, and `needs` tells their digests.
+
+    A plugin that is not installed here has all its recorded fields spelt out. Many cells share a cached `lookup`.
+    """
+    head, spec = cell.head, functools.partial(_spec, lookup)
+    needs: dict[str, None] = {}
+    options = [("--task", _task(head)), ("--defense", spec(registry.DEFENSE, head["defense"], needs))]
+    if head["attack"] is not None:
+        options.append(("--attack", spec(registry.ATTACK, head["attack"], needs)))
+    options.append(("--extractor", spec(registry.EXTRACTOR, head["dataset"]["extractor"], needs)))
+    if head["dataset"].get("spec"):
+        options.append(("--dataset", spec(registry.DATASET, head["dataset"]["spec"], needs)))
+    elif head["dataset"]["name"] != BUILTIN:
+        options.append(("--images", str(head["dataset"]["name"])))
+        needs[f"{head['dataset']['name']}: a folder of the photographs with the content {head['dataset']['hash']}"] = None
+    options += [("--metric", text) for text in _metrics(lookup, head["metric_settings"], needs)]
+    seeds = sorted({one.record["seed"] for one in cell.found})
+    default = {"--task": HERE[0], "--extractor": "sift"}
+    words = ["bench run", *(_option(option, text) for option, text in options if default.get(option) != text)]
+    return Recipe("\n".join(" ".join([*words, f"--seed {seed}"]) for seed in seeds), tuple(needs))
+
+
+def _option(name: str, text: str) -> str:
+    """An option for a shell, whatever its value is."""
+    return f"{name}{'=' if text.startswith('-') else ' '}{shlex.quote(text)}"
+
+
+def _task(head: Record) -> str:
+    inversion = (head["attack"] or {}).get("inversion")
+    painter = inversion["name"] if inversion else HERE[1]
+    return str(head["task"]) if painter == HERE[1] else f"{head['task']}:inverter={painter}"
+
+
+def _metrics(lookup: Lookup, settings: Mapping[str, Mapping[str, Any]], needs: dict[str, None]) -> Iterator[str]:
+    """Those that are measured only where they are asked for."""
+    for name, content in settings.items():
+        plugin = lookup(registry.METRIC, name)
+        if plugin and fields.without_default(plugin):
+            yield _spec(lookup, registry.METRIC, {"name": name, **content}, needs)
+
+
+def _spec(lookup: Lookup, kind: Kind, configuration: Mapping[str, Any], needs: dict[str, None]) -> str:
+    """A plugin as the command line takes it, without the fields that are as they are by default."""
+    plugin = lookup(kind, configuration["name"])
+    defaults = fields.defaults(plugin) if plugin else {}
+    given = []
+    for field, value in configuration.items():
+        if field == "name" or isinstance(value, dict) or (plugin and field not in fields.field_types(plugin)):
+            continue  # what other plugins do in its stead is no field
+        text = _text(value)
+        if field not in defaults or text != _text(defaults[field]):
+            given.append(f"{field}={text}")
+            if text == "FILE":
+                needs[f"FILE for {field} of {configuration['name']}: {value}"] = None
+    return configuration["name"] + (":" + ",".join(given) if given else "")
+
+
+def _text(value: Any) -> str:
+    if value is None or isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, float):
+        return repr(float(value)).removesuffix(".0")
+    if str(value).startswith("sha256:"):
+        return _shipped().get(str(value), "FILE")
+    return str(value)
+
+
+@functools.cache
+def _shipped() -> dict[str, str]:
+    """Digest of each file that is part of this installation -> the name that a field gives it."""
+    names = {file: name for name, file in SHIPPED.items()}
+    return {digest: names.get(file, "shipped") for file, digest in _digests()}
+
+
+def _digests() -> Iterator[tuple[str, str]]:
+    """From the files' headers, without the rest of them."""
+    from safetensors import safe_open
+
+    for path in sorted(ASSETS.glob("*.safetensors")):
+        with safe_open(path, framework="numpy") as opened:
+            yield path.name, (opened.metadata() or {}).get("digest", "")

@@ -1,0 +1,344 @@
+"""Somebody's records, checked: whether they are whole, say what they hash, are possible, and come out again.
+
+A sample of them is made again here. Attacks then run in a process that never holds the secret (`bench.isolation`), so that one
+which looked at what it must not see cannot repeat its numbers.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from bench import fields, records, registry, runner, spec, trials
+from bench.datasets.photographs import folder
+from bench.errors import UnitError, UserError
+from bench.isolation import isolated
+from bench.plugin import Asset, Plugin, Task
+from bench.progress import Progress
+from bench.public import ASSETS, REFERENCES, SHIPPED
+from bench.records import EVERY_UNIT, Record
+from bench.registry import Kind
+from bench.runner import Asked, Cell, Plan
+from bench.trials import Trials
+from bench.units import Images
+from leaderboard.regression import ABSOLUTE_FLOOR, RELATIVE_FLOOR
+
+P = TypeVar("P", bound=Plugin)
+
+SCHEMA = ASSETS / "record.schema.json"
+BUILTIN = "builtin"  # the photographs that everyone has
+LONGEST = 160  # characters of a complaint about what is in a line
+ROUNDING = 1e-9  # relative, between computers, of what follows from the configuration alone
+
+
+@dataclass(frozen=True, order=True)
+class Fault:
+    """What is wrong with a line, counted from 1."""
+
+    line: int
+    what: str
+
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """A record that keeps the schema, and where it stands."""
+
+    number: int
+    record: Record
+
+
+def check(
+    path: Path, *, images: Path | None = None, files: Sequence[Path] = (), sample: int = 3, seed: int = 0
+) -> tuple[int, list[Fault]]:
+    """How many lines there are, and what is wrong with them.
+
+    Parameters
+    ----------
+    images : the photographs that were used, if they are not the built-in ones
+    files : dictionaries and networks that the records know by digest
+    sample : records to make again
+    seed : of the sample
+
+    Raises
+    ------
+    UserError
+        if there is no such file, or no such `images` or `files`.
+    """
+    if not path.is_file():
+        raise UserError(f"{path}: no such file")
+    texts = path.read_bytes().split(b"\n")
+    texts = texts[:-1] if not texts[-1] else texts
+    here = _Here(images, files)
+    read = list(_read(texts))
+    lines = [one for one in read if isinstance(one, Line)]
+    found = [one for one in read if isinstance(one, Fault)]
+    found += [Fault(line.number, what) for line in lines for what in _inconsistent(line.record)]
+    found += _duplicates(lines)
+    planned = [part for group in _plans(lines, here) for part in group]
+    found += [part for part in planned if isinstance(part, Fault)]
+    cells = [part for part in planned if not isinstance(part, Fault)]
+    for _, cell, members, plan in cells:
+        found += _impossible(cell, members, plan)
+    done = [(plan, cell, line) for _, cell, members, plan in cells for line in members if line.record["status"] == "ok"]
+    found += _again(done, sample, seed)
+    if not texts:
+        found.append(Fault(1, "there is no record"))
+    return len(texts), sorted(set(found))
+
+
+# ---- a line by itself
+
+
+def _read(texts: Sequence[bytes]) -> Iterator[Line | Fault]:
+    from jsonschema import Draft202012Validator
+
+    validator = Draft202012Validator(json.loads(SCHEMA.read_text(encoding="utf-8")))
+    for number, text in enumerate(texts, start=1):
+        try:
+            record = json.loads(text, parse_constant=_refuse)
+        except ValueError as error:
+            yield Fault(number, f"no JSON: {error}")
+            continue
+        wrong = sorted(validator.iter_errors(record), key=lambda error: error.json_path)
+        for error in wrong:
+            yield Fault(number, f"{error.json_path.removeprefix('$').lstrip('.') or 'the record'}: {_short(error.message)}")
+        if not wrong and (unbounded := _not_finite(record)):
+            yield Fault(number, f"{unbounded}: not finite")
+        elif not wrong:
+            yield Line(number, record)
+
+
+def _refuse(constant: str) -> None:
+    raise ValueError(f"{constant} is no number of JSON")
+
+
+def _not_finite(value: Any, path: str = "") -> str | None:
+    """Where a number lies that JSON can write and no double can hold, such as 1e999."""
+    if isinstance(value, dict):
+        return next((found for name, inner in value.items() if (found := _not_finite(inner, f"{path}.{name}"))), None)
+    return path.lstrip(".") if isinstance(value, float) and not math.isfinite(value) else None
+
+
+def _inconsistent(record: Record) -> Iterator[str]:
+    """Hashes that are not those of what they stand for, and metrics out of their range."""
+    task = {"name": record["task"], **record["task_settings"]}
+    configured = (task, record["defense"], record["attack"], record["dataset"], record["seed"], record["metric_settings"])
+    if (right := records.cell_id(*configured)) != record["cell_id"]:
+        yield f"cell_id: is {record['cell_id']}, but that of this configuration is {right}"
+    if (right := records.run_hash(record["cell_id"], record["environment"])) != record["run_hash"]:
+        yield f"run_hash: is {record['run_hash']}, but that of this cell and environment is {right}"
+    known = {metric.name(): metric for metric in registry.everything(registry.METRIC)}
+    for name, value in record["metrics"].items():
+        if name in known and value is not None and not known[name].range[0] <= value <= known[name].range[1]:
+            low, high = known[name].range
+            yield f"metrics.{name}: {value:g} is not from {low:g} to {high:g}"
+    if record["status"] == "ok" and record["privacy"]["keypoints"] != record["metrics"]["keypoints"]:
+        yield "privacy.keypoints: not the keypoints of metrics"
+
+
+def _duplicates(lines: Sequence[Line]) -> Iterator[Fault]:
+    """A unit of a cell that stands there twice; one that had failed may have been done again."""
+    seen: dict[tuple[str, str], Line] = {}
+    for line in lines:
+        key = line.record["cell_id"], line.record["unit"]
+        if key in seen and seen[key].record["status"] != "failed":
+            yield Fault(line.number, f"the same unit of the same cell as line {seen[key].number}")
+        seen[key] = line
+
+
+# ---- cells, planned again from their configurations
+
+
+class _Here:
+    """What there is on this machine to plan with."""
+
+    def __init__(self, images: Path | None, files: Sequence[Path]) -> None:
+        self.images = None if images is None else folder(images)
+        shipped = {_digest(ASSETS / file): Asset(name) for name, file in SHIPPED.items() if (ASSETS / file).is_file()}
+        self.assets = shipped | {_digest(file): Asset(file) for file in files}  # what fields call the content of a digest
+
+    def photographs(self, record: Record) -> Images:
+        """The photographs of a record.
+
+        Raises
+        ------
+        UserError
+            if they are not here.
+        """
+        if record["dataset"]["spec"] is not None or record["dataset"]["name"] == BUILTIN:
+            return None
+        if self.images is None:
+            raise UserError(f"cannot be checked without the photographs of {record['dataset']['name']}: give --images")
+        return self.images
+
+    def plugin(self, kind: Kind[P], configuration: Mapping[str, Any]) -> P:
+        """The plugin of a configuration. Files that are not here are taken to be its default ones.
+
+        Raises
+        ------
+        UserError
+            if it is not installed, or refuses a field.
+        """
+        plugin = registry.lookup(kind, configuration["name"])
+        types = fields.field_types(plugin)
+        given = {}
+        for name in types.keys() & configuration.keys():
+            value = configuration[name]
+            if types[name] is Asset and str(value).startswith("sha256:"):
+                if value in self.assets:
+                    given[name] = self.assets[value]
+            else:
+                text = str(value).lower() if value is None or isinstance(value, bool) else str(value)
+                try:
+                    given[name] = fields.convert(types[name], text)
+                except ValueError:
+                    raise UserError(f"{plugin.name()}: {name} must be {fields.expected(types[name])}, not {text!r}") from None
+        return spec.build(plugin, given)
+
+
+Planned = tuple[int, Cell, list[Line], Plan]
+
+
+def _plans(lines: Sequence[Line], here: _Here) -> Iterator[list[Planned | Fault]]:
+    """Each cell with its lines, and the plan that it is of; or why there is none."""
+    groups: dict[str, list[Line]] = {}
+    for line in lines:
+        groups.setdefault(line.record["cell_id"], []).append(line)
+    for members in groups.values():
+        first = members[0]
+        try:
+            plan = runner.planned(_asked(first.record, here))
+            yield [(first.number, plan.cells[0], members, plan)]
+        except (UserError, UnitError) as error:
+            yield [Fault(first.number, " ".join(str(error).split()))]
+
+
+def _asked(record: Record, here: _Here) -> Asked:
+    task: Task = here.plugin(registry.TASK, {"name": record["task"], **record["task_settings"]})
+    dataset = record["dataset"]["spec"]
+    defense = here.plugin(registry.DEFENSE, record["defense"])
+    quantised = defense.quantised_by
+    if dataset is not None and quantised is not None and record["defense"][quantised] not in here.assets:
+        defense = dataclasses.replace(defense, **{quantised: Asset(REFERENCES)})  # type: ignore[type-var]
+    return Asked(
+        pairs=((defense, None if record["attack"] is None else here.plugin(registry.ATTACK, record["attack"])),),
+        images=here.photographs(record),
+        task=task,
+        extractor=here.plugin(registry.EXTRACTOR, record["dataset"]["extractor"]),
+        dataset=None if dataset is None else here.plugin(registry.DATASET, dataset),
+        seed=record["seed"],
+    )
+
+
+def _impossible(cell: Cell, members: Sequence[Line], plan: Plan) -> Iterator[Fault]:
+    """What cannot be so in a cell: other inputs than those here, a pair that does not apply, other promises, units left out."""
+    first = members[0]
+    if cell.head["cell_id"] != first.record["cell_id"]:
+        yield Fault(first.number, f"another cell than can be made here: {_difference(first.record, cell.head)}")
+        return
+    names = {unit.name for unit in plan.units}
+    for line in members:
+        record = line.record
+        if (cell.reason is None) == (record["status"] == "n/a"):
+            told = f"does not apply ({cell.reason})" if cell.reason else "applies, but the record says n/a"
+            yield Fault(line.number, f"status: the pair {told}")
+        if record["unit"] not in (names if cell.reason is None else {EVERY_UNIT}):
+            yield Fault(line.number, f"unit: the dataset has no {record['unit']!r}")
+        right = trials.privacy(cell, record["privacy"]["keypoints"])
+        for name, value in right.items():
+            if not _close(record["privacy"][name], value):
+                yield Fault(line.number, f"privacy.{name}: is {_short(record['privacy'][name])}, should be {_short(value)}")
+    missing = sorted(names - {line.record["unit"] for line in members}) if cell.reason is None else []
+    if missing:
+        yield Fault(first.number, f"its cell lacks {len(missing)} of {len(names)} units, such as {missing[0]!r}")
+
+
+def _difference(record: Record, here: Record) -> str:
+    """The first part of the configuration that is another here."""
+    for part in ("defense", "attack", "dataset", "metric_settings", "task_settings"):
+        theirs, ours = record[part] or {}, here[part] or {}
+        for name in (*theirs, *ours):
+            if theirs.get(name) != ours.get(name) and (part != "dataset" or name not in ("name", "spec")):
+                return f"{part}.{name} is {_short(theirs.get(name))}, here {_short(ours.get(name))} (give its file by --file?)"
+    return "its configuration is the same"
+
+
+# ---- a sample, made again
+
+
+def _again(done: Sequence[tuple[Plan, Cell, Line]], sample: int, seed: int) -> Iterator[Fault]:
+    """What of the sample comes out differently where the attack's process does not hold the secret."""
+    usable = [one for one in done if one[1].head["cell_id"] == one[2].record["cell_id"]]
+    chosen = np.sort(np.random.default_rng(seed).permutation(len(usable))[:sample])
+    with Progress("made again", len(chosen)) as progress:
+        for plan, cell, line in (usable[place] for place in chosen):
+            yield from _compared(line, _made_again(plan, cell, line.record["unit"]))
+            progress.advance(note=line.record["unit"])
+
+
+def _made_again(plan: Plan, cell: Cell, name: str) -> Record | None:
+    unit = next((unit for unit in plan.units if unit.name == name), None)
+    apart = dataclasses.replace(plan, carry_out=isolated)
+    return None if unit is None or cell.reason else Trials(apart).carry_out(cell, unit).record
+
+
+def _compared(line: Line, again: Record | None) -> Iterator[Fault]:
+    if again is None:
+        return  # that it cannot be is told already
+    if again["status"] != "ok":
+        yield Fault(line.number, f"made again, it failed: {_short(again['reason'])}")
+        return
+    told = line.record["metrics"]
+    for name in sorted({*told, *again["metrics"]}):
+        theirs, ours = told.get(name), again["metrics"].get(name)
+        if theirs is None or ours is None:
+            right = theirs is ours
+        else:
+            right = abs(theirs - ours) <= ABSOLUTE_FLOOR + RELATIVE_FLOOR * abs(ours)
+        if not right:
+            yield Fault(line.number, f"metrics.{name}: is {_number(theirs)}, and {_number(ours)} when it is made again")
+
+
+def _close(one: Any, other: Any) -> bool:
+    numbers = all(isinstance(value, (int, float)) and not isinstance(value, bool) for value in (one, other))
+    return math.isclose(one, other, rel_tol=ROUNDING) if numbers else bool(one == other)
+
+
+def _number(value: float | None) -> str:
+    return "missing" if value is None else f"{value:.6g}"
+
+
+def _short(value: Any) -> str:
+    """Of one line, and not too long, whatever somebody wrote."""
+    text = " ".join(str(value).split())
+    text = "".join(letter if letter.isprintable() else "?" for letter in text)
+    return text if len(text) <= LONGEST else text[: LONGEST - 3] + "..."
+
+
+def _digest(path: Path) -> str:
+    """What records know a file by, from its header.
+
+    Raises
+    ------
+    UserError
+        if it is no safetensors file of this program's.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="numpy") as opened:
+            return str((opened.metadata() or {})["digest"])
+    except (OSError, SafetensorError, KeyError) as error:
+        raise UserError(f"--file {path}: no dictionary and no network of this program's ({error})") from None
+
+
+def lines(faults: Iterable[Fault]) -> Iterator[str]:
+    """One line each."""
+    return (f"line {fault.line}: {fault.what}" for fault in faults)

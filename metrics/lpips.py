@@ -1,0 +1,85 @@
+"""Learned perceptual distance (Zhang et al., CVPR 2018), where the user has the weights of the network that it rests on."""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+import pickle
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, ClassVar, Literal
+
+from bench.errors import UserError
+from bench.kernels.pairs import Doubles, image_pair
+from bench.plugin import Metric
+from bench.types import Floats
+
+
+@dataclass(frozen=True, kw_only=True)
+class LPIPS(Metric):
+    """Learned perceptual distance, by its authors' library: that of AlexNet's features, weighted as people judged.
+
+    `weights` are torchvision's for AlexNet on ImageNet (alexnet-owt-7be5be79.pth). They are no part of this program, and nothing
+    is downloaded; so this metric is told only where it is asked for.
+    """
+
+    compares: ClassVar[Literal["images", "descriptors"]] = "images"
+    unit: ClassVar[str] = "distance"
+    range: ClassVar[tuple[float, float]] = (0.0, float("inf"))
+    higher_is_better_for: ClassVar[Literal["attacker", "defender"]] = "defender"
+    parameters: ClassVar[Mapping[str, Any]] = MappingProxyType({"network": "alex", "version": "0.1"})
+
+    weights: Path
+
+    def __post_init__(self) -> None:
+        if importlib.util.find_spec("lpips") is None:
+            raise UserError("lpips: its library is not installed; pip install 'feature-privacy-bench[lpips]'")
+        if not self.weights.is_file():
+            raise UserError(f"lpips: {self.weights}: no such file; it is torchvision's alexnet-owt-7be5be79.pth")
+        _network(self.weights)
+
+    def __call__(self, truth: Floats, estimate: Floats) -> float:
+        import torch
+
+        # (H, W, 3) in [0, 1] each
+        images = [_tensor(image) for image in image_pair(truth, estimate)]
+        with torch.no_grad():
+            return float(_network(self.weights)(*images, normalize=True))
+
+
+def _tensor(image: Doubles) -> Any:
+    """(H, W, 3) -> (1, 3, H, W) float32"""
+    import torch
+
+    return torch.from_numpy(image.astype("float32")).permute(2, 0, 1)[None]
+
+
+@functools.lru_cache(maxsize=1)
+def _network(weights: Path) -> Any:
+    """The library's network, with the user's weights in the place of those that it would download.
+
+    Raises
+    ------
+    UserError
+        if they are not AlexNet's.
+    """
+    import lpips
+    import torch
+
+    settings = LPIPS.parameters
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the library asks torchvision for a network in a way of old
+        network = lpips.LPIPS(net=settings["network"], version=settings["version"], pnet_rand=True, verbose=False)
+    layers = network.net.state_dict()  # slice1.0.weight for features.0.weight
+    try:
+        given = torch.load(weights, map_location="cpu", weights_only=True)
+        network.net.load_state_dict({name: given[f"features.{name.partition('.')[2]}"] for name in layers})
+    except (KeyError, RuntimeError, TypeError, pickle.UnpicklingError) as error:
+        raise UserError(f"lpips: {weights}: these are not torchvision's weights of AlexNet ({type(error).__name__})") from error
+    return network
+
+
+PLUGIN = LPIPS

@@ -1,0 +1,132 @@
+"""Records that are made up for tests of what is made from records."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from bench.records import FILE, SCHEMA, cell_id, run_hash
+
+SIFT = {"name": "sift", "upright": True, "max_keypoints": 1000}
+ENVIRONMENT = {"version": "0.1.0", "source": "sha256:" + "5" * 64, "torch": "2.14", "device": "cpu", "threads": 2}
+SETTINGS = {"ssim": {"sigma": 1.5}, "mae": {}}
+PHOTOGRAPHS = {"name": "photos", "hash": "sha256:" + "a" * 64, "extractor": SIFT}
+GALLERY = {"name": "gallery", "hash": "sha256:" + "b" * 64, "extractor": SIFT}
+DIA = {"name": "dia", "weights": "sha256:" + "d" * 64}
+UNCOVERED = ["the keypoints' positions", "the number of keypoints"]
+
+
+def ldp(epsilon: float) -> dict[str, Any]:
+    return {"name": "ldp", "epsilon": epsilon, "subset_size": 2, "dictionary": "sha256:" + "c" * 64}
+
+
+def record(
+    unit: str,
+    metrics: dict[str, Any],
+    *,
+    defense: dict[str, Any],
+    attack: dict[str, Any] | None = DIA,
+    task: str = "reconstruction",
+    dataset: dict[str, Any] = PHOTOGRAPHS,
+    seed: int = 0,
+    status: str = "ok",
+    reason: str | None = None,
+    environment: dict[str, Any] = ENVIRONMENT,
+    settings: dict[str, Any] = SETTINGS,
+    **more: Any,
+) -> dict[str, Any]:
+    """One record, as the runner writes it."""
+    cell = cell_id({"name": task}, defense, attack, dataset, seed, settings)
+    epsilon = defense.get("epsilon")
+    keypoints = metrics.get("keypoints", 100) if status == "ok" else None
+    return {
+        "schema": SCHEMA,
+        "task": task,
+        "defense": defense,
+        "attack": attack,
+        "dataset": dataset,
+        "metric_settings": settings,
+        "seed": seed,
+        "cell_id": cell,
+        "run_hash": run_hash(cell, environment),
+        "environment": environment,
+        "unit": unit,
+        "status": status,
+        "reason": reason,
+        "metrics": metrics,
+        "privacy": {
+            "guarantee": "none" if epsilon is None else "epsilon-ldp",
+            "epsilon_descriptor": epsilon,
+            "keypoints": keypoints,
+            "releases": 1,
+            "epsilon_image": epsilon and keypoints and epsilon * keypoints,
+            "epsilon_image_optimal": epsilon and keypoints and epsilon * keypoints * 0.9,
+            "delta": 1e-6,
+            "uncovered": UNCOVERED,
+            "log10_true": None if epsilon is None else -1.0,
+            "seeded": True,
+            "private": False,
+        },
+        "seconds": 0.5,
+        "notes": [],
+    } | more
+
+
+def reconstructions(defense: dict[str, Any], scores: Sequence[float], **more: Any) -> list[dict[str, Any]]:
+    """One record for each score, which is an SSIM; units 0.png, 1.png, ..."""
+    return [
+        record(
+            f"{number}.png", {"ssim": score, "mae": round(0.6 - score / 2, 4), "keypoints": 100 + number}, defense=defense, **more
+        )
+        for number, score in enumerate(scores)
+    ]
+
+
+def localizations(
+    defense: dict[str, Any], found: Sequence[int], conditions: Sequence[str | None], **more: Any
+) -> list[dict[str, Any]]:
+    """One record for each query: whether it is localized, and under which condition."""
+    given = {"task": "localization", "attack": None, "dataset": GALLERY} | more
+    return [
+        record(f"query/{number}.jpg", _localized(hit), defense=defense, condition=condition, **given)
+        for number, (hit, condition) in enumerate(zip(found, conditions, strict=True))
+    ]
+
+
+def inapplicable(defense: dict[str, Any], attack: dict[str, Any], reason: str, **more: Any) -> dict[str, Any]:
+    return record("*", {}, defense=defense, attack=attack, status="n/a", reason=reason, **more)
+
+
+def write(folder: Path, records: Sequence[dict[str, Any]]) -> Path:
+    """A folder as `bench run` leaves it, with a picture for each reconstruction and each photograph."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / FILE).open("w") as file:
+        for one in records:
+            file.write(json.dumps(one, allow_nan=False) + "\n")
+    return folder
+
+
+def paint(path: Path, seed: int) -> Path:
+    """A smooth picture."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    rng = np.random.default_rng(seed)
+    coarse = Image.fromarray(rng.integers(0, 256, (6, 6, 3), dtype=np.uint8))
+    coarse.resize((256, 256), Image.Resampling.BICUBIC).save(path)
+    return path
+
+
+def _localized(hit: int) -> dict[str, Any]:
+    return {
+        "recall_0.25m_2deg": float(hit),
+        "recall_0.5m_5deg": float(hit),
+        "recall_5m_10deg": 1.0,
+        "translation_error": 0.1 if hit else None,
+        "rotation_error": 0.5 if hit else None,
+        "inliers": 80 if hit else 5,
+        "matches": 120,
+        "trials": 1000,
+        "keypoints": 150,
+    }

@@ -1,0 +1,105 @@
+"""What the documents show works as it stands there: each command is run, in one folder and in their order, on small data.
+
+Some are run in a smaller form, or not at all; SMALLER and ELSEWHERE say which, how, and why.
+"""
+
+import re
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from fakes import album
+
+from bench import cli, skeleton
+from bench.cli import parser
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = ("method", "formats", "extending", "scale")
+
+# Run with more options, or fewer images, so that it takes seconds.
+SMALLER = {
+    "run --defense ldp --attack dia": "--images photos/",
+    "dataset gallery --layout colmap --views 2 --queries 2 --out gallery/": "gallery:width=64,height=48,detail=0.1",
+    "train --defense none --images photos/ --out W.safetensors --log logs/": "--steps 1 --batch 1 --widths 8,8",
+    "export --images photos/ --defense affine --attack nearest --layout hloc --out recovered.h5": "--images one/",
+    "scale --markdown": "--words 1000",
+}
+# Another test runs it: it needs what that test makes.
+ELSEWHERE = {
+    "reproduce table1 --profile smoke": "test_reproduce.py, and .ci/run as it stands",
+    "run --defense my-defense --attack keypoints": "test_skeleton.py, with the package installed",
+    "audit --defense ldp:epsilon=1/3,subset_size=1 --words 3 --trials 20000": "test_guarantee.py",
+}
+
+
+def commands(page: str) -> list[str]:
+    text = (ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8")
+    return re.findall(r"^bench (.+)$", text, re.MULTILINE)
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Photographs, results and a baseline, as whoever reads the documents has them."""
+    folder = tmp_path_factory.mktemp("documents")
+    album(folder / "photos", 3)
+    album(folder / "one", 1)
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.chdir(folder)
+        assert cli.main(shlex.split("run --defense none --attack keypoints --images photos/ --out runs/x")) == 0
+        (folder / "baseline.jsonl").write_bytes((folder / "runs" / "x" / "records.jsonl").read_bytes())
+        yield folder
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_commands_run(page: str, place: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    found = commands(page)
+    assert found
+    for command in found:
+        assert cli.main(arguments(command)) == 0, (command, capfd.readouterr().err)
+
+
+def arguments(command: str) -> list[str]:
+    """What is run for a command of a document."""
+    words = shlex.split(command)
+    args, extra = parser().parse_known_args(words)
+    assert not extra
+    assert all(getattr(args, option) for option in args.required)
+    if command in ELSEWHERE:
+        return ["list", "metrics"]
+    if command.startswith("dataset gallery"):
+        return [SMALLER[command] if word == "gallery" else word for word in words]
+    if command.startswith("submit-check"):
+        return [*words, "--images", "photos/"]
+    return [*words, *shlex.split(SMALLER.get(command, ""))]
+
+
+def test_what_is_said_of_commands_is_of_commands_that_are_there() -> None:
+    every = {command for page in PAGES for command in commands(page)}
+    assert every >= SMALLER.keys() | ELSEWHERE.keys()
+
+
+def test_all_kinds_of_plugins_are_shown() -> None:
+    assert {command.split()[1] for command in commands("extending") if command.startswith("new ")} == set(skeleton.KINDS)
+
+
+def test_targets_of_make_are_there() -> None:
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    for name in ("CONTRIBUTING.md", "docs/method.md", "docs/scale.md", "README.md"):
+        for target in re.findall(r"(?:^|`)make ([a-z]+)", (ROOT / name).read_text(encoding="utf-8"), re.MULTILINE):
+            assert f"\n{target}:" in makefile, f"{name}: make {target}"
+
+
+def test_links_lead_somewhere() -> None:
+    for path in (*(ROOT / "docs").glob("*.md"), ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md"):
+        for link in re.findall(r"\]\(([^)#]+)\)", path.read_text(encoding="utf-8")):
+            assert link.startswith("https://") or (path.parent / link).exists(), f"{path.name}: {link}"
+
+
+def test_citation_is_of_this_version() -> None:
+    pyproject = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    version = re.search(r'^version = "(.+)"$', pyproject, re.MULTILINE)
+    assert version is not None
+    assert f"\nversion: {version[1]}\n" in citation
+    assert citation.startswith("cff-version: 1.2.0\n")

@@ -1,0 +1,127 @@
+"""LPIPS of weights that are made up here, against its formula; and how it is asked for."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from fake_plugins.painter import Painter
+from fakes import FAKES, album, install
+
+from bench import cli, registry, runner, spec, testing
+from bench.errors import UserError
+from defenses.none import Undefended
+
+pytest.importorskip("lpips", reason="the library is not installed (pip install -e '.[lpips]')")
+torchvision = pytest.importorskip("torchvision", reason="torchvision is not installed (pip install -e '.[lpips]')")
+
+from metrics.lpips import LPIPS  # noqa: E402
+
+RELUS = (1, 4, 7, 9, 11)  # of AlexNet's layers, those that the paper compares after
+SHIFT, SCALE = np.array([-0.030, -0.088, -0.188]), np.array([0.458, 0.448, 0.450])
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """AlexNet's, drawn at random: what they were trained for has no part in the formula."""
+    torch.manual_seed(0)
+    path = tmp_path_factory.mktemp("weights") / "alexnet.pth"
+    torch.save(torchvision.models.alexnet(weights=None).state_dict(), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def images() -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(0)
+    truth = rng.random((96, 80, 3), dtype=np.float32)
+    return truth, np.clip(truth + rng.normal(0, 0.2, truth.shape), 0, 1).astype(np.float32)
+
+
+def by_definition(weights: Path, truth: np.ndarray, estimate: np.ndarray) -> float:
+    """Eq. (1) of the paper: unit-norm features, their squared differences weighed by channel, averaged over places, summed."""
+    import lpips
+
+    network = torchvision.models.alexnet(weights=None).eval()
+    network.load_state_dict(torch.load(weights, weights_only=True))
+    heads = torch.load(Path(lpips.__file__).parent / "weights" / "v0.1" / "alex.pth", map_location="cpu", weights_only=True)
+    layers: list[list[np.ndarray]] = []
+    for image in (truth, estimate):
+        x = torch.from_numpy((((image * 2.0 - 1.0) - SHIFT) / SCALE).astype(np.float32)).permute(2, 0, 1)[None]
+        found = []
+        for place, layer in enumerate(network.features):
+            x = layer(x)
+            if place in RELUS:
+                features = x[0].detach().numpy().astype(np.float64).copy()  # (C, h, w)
+                found.append(features / (np.linalg.norm(features, axis=0) + 1e-10))
+        layers.append(found)
+    total = 0.0
+    for number, (one, other) in enumerate(zip(*layers, strict=True)):
+        weight = heads[f"lin{number}.model.1.weight"][0, :, 0, 0].numpy()
+        total += float(np.einsum("c,chw->hw", weight, (one - other) ** 2).mean())
+    return total
+
+
+def test_it_is_what_the_paper_says(weights: Path, images: tuple[np.ndarray, np.ndarray]) -> None:
+    found = LPIPS(weights=weights)(*images)
+    assert found == pytest.approx(by_definition(weights, *images), rel=1e-4)
+    assert found > 0
+
+
+def test_it_keeps_the_contract_of_metrics(weights: Path) -> None:
+    registry.check(registry.METRIC, LPIPS)
+    testing.check_metric(LPIPS(weights=weights))
+
+
+def test_its_settings_are_the_weights_by_content(weights: Path, tmp_path: Path) -> None:
+    album(tmp_path / "album", 1)
+    plan = runner.planned(
+        runner.Asked(
+            pairs=((Undefended(), Painter()),),
+            images=tmp_path / "album",
+            task=spec.read("reconstruction", registry.TASK),
+            extractor=spec.read("sift", registry.EXTRACTOR),
+            dataset=None,
+            seed=0,
+            metrics=(LPIPS(weights=weights),),
+        )
+    )
+    settings = plan.cells[0].head["metric_settings"]
+    assert settings["lpips"]["weights"].startswith("sha256:")
+    assert settings["lpips"]["network"] == "alex"
+    assert "ssim" in settings
+
+
+def test_other_files_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="absent: no such file"):
+        LPIPS(weights=tmp_path / "absent")
+    wrong = tmp_path / "wrong.pth"
+    torch.save({"features.0.weight": torch.zeros(3)}, wrong)
+    with pytest.raises(UserError, match="not torchvision's weights of AlexNet"):
+        LPIPS(weights=wrong)
+    wrong.write_bytes(b"nothing of the kind")
+    with pytest.raises(UserError, match="not torchvision's weights of AlexNet"):
+        LPIPS(weights=wrong)
+
+
+def test_it_is_measured_where_it_is_asked_for(
+    weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    install(tmp_path / "installed", monkeypatch, FAKES)
+    album(tmp_path / "album", 1)
+    monkeypatch.chdir(tmp_path)
+    command = ["run", "--defense", "none", "--attack", "painter", "--images", "album", "--json"]
+
+    def metrics(*more: str) -> dict[str, Any]:
+        import json
+
+        assert cli.main([*command, *more]) == 0
+        return dict(json.loads(capsys.readouterr().out)["metrics"])
+
+    assert "lpips" not in metrics("--out", "a")
+    assert metrics("--out", "b", "--metric", f"lpips:weights={weights}")["lpips"] > 0
+    assert cli.main([*command, "--metric", "ssim", "--out", "c"]) == 2
+    assert "needs not be asked for" in capsys.readouterr().err
+    assert cli.main([*command, "--metric", "lpips", "--out", "c"]) == 2
+    assert "lpips needs weights (a path)" in capsys.readouterr().err
+    assert not Path("c").exists()

@@ -1,0 +1,345 @@
+"""The page, in a real browser: what a reader does with it, by mouse, by keyboard and on a phone."""
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import fabricated
+import pytest
+from fabricated import DIA, ENVIRONMENT, PHOTOGRAPHS, SETTINGS, inapplicable, ldp, localizations, paint, reconstructions
+
+from bench.records import cell_id
+from bench.rundir import picture
+from leaderboard import site
+from leaderboard.report import photograph
+
+playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+
+CHROMIUM = shutil.which("chromium")
+FLAGS = [
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+]
+HOSTILE = """"><script>window.owned = 1</script><img src=x onerror="window.owned = 2">'{{ 7 * 7 }}</style></script>"""
+NONE, AFFINE, NEAREST = {"name": "none"}, {"name": "affine", "dim": 4}, {"name": "nearest"}
+DAYS = ["day", "night"] * 4
+
+
+def results(folder: Path) -> Path:
+    """Five defenses, of which one is unranked and one comes from somebody who means harm."""
+    hostile = {"name": HOSTILE, HOSTILE: HOSTILE}
+    strange = PHOTOGRAPHS | {"name": f"zoo {HOSTILE}", "hash": "sha256:" + "f" * 64}
+    reconstructed = [
+        *reconstructions(NONE, [0.8, 0.7, 0.9]),
+        *reconstructions(AFFINE, [0.4, 0.5, 0.3]),
+        *reconstructions(AFFINE, [0.6, 0.5, 0.7], attack=NEAREST),
+        *reconstructions(ldp(16.0), [0.5, 0.4, 0.6]),
+        *reconstructions(ldp(4.0), [0.2, 0.1, 0.3]),
+        *reconstructions({"name": "new"}, [0.01, 0.01, 0.01], attack=NEAREST),
+        *reconstructions(hostile, [0.95, 0.95, 0.95], reason=None, notes=[HOSTILE]),
+        *reconstructions(NONE, [0.5], dataset=strange),
+    ]
+    others = [
+        inapplicable({"name": "new"}, DIA, f"no adapted attacker {HOSTILE}"),
+        inapplicable(NONE, NEAREST, "nearest attacks Subspaces; none releases Descriptors"),
+        *localizations(NONE, [1, 1, 1, 1, 1, 1, 1, 0], DAYS),
+        *localizations(AFFINE, [1, 1, 1, 0, 0, 1, 0, 0], DAYS),
+        *localizations(ldp(16.0), [1, 1, 1, 1, 1, 0, 0, 0], DAYS),
+        *localizations(ldp(4.0), [1, 0, 0, 0, 0, 0, 0, 0], DAYS),
+        *localizations({"name": "new"}, [0] * 8, DAYS),
+    ]
+    for number, record in enumerate(reconstructed):
+        paint(picture(folder, record), number)
+        if record["unit"] != "2.png":  # of which the photograph has gone
+            paint(photograph(folder, record), 1000 + int(record["unit"][0]))
+    return fabricated.write(folder, [*reconstructed, *others])
+
+
+@pytest.fixture(scope="module")
+def index(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("leaderboard")
+    return site.write(results(folder / "runs"), folder / "site").page
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    if CHROMIUM is None:
+        pytest.skip("there is no Chromium here (.ci/run installs it)")
+    with playwright.sync_playwright() as running:
+        opened = running.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        yield opened
+        opened.close()
+
+
+@pytest.fixture
+def page(browser: Any, index: Path) -> Iterator[Any]:
+    """The page as it opens. At the end nothing has been complained of, and nothing was asked of any network."""
+    yield from opened(browser, index, {"width": 1200, "height": 900})
+
+
+@pytest.fixture
+def phone(browser: Any, index: Path) -> Iterator[Any]:
+    yield from opened(browser, index, {"width": 360, "height": 740})
+
+
+def opened(browser: Any, index: Path, size: dict[str, int]) -> Iterator[Any]:
+    context = browser.new_context(viewport=size)
+    page = context.new_page()
+    page.set_default_timeout(10_000)
+    said, asked = [], []
+    page.on("console", lambda message: said.append(message.text))
+    page.on("pageerror", lambda error: said.append(str(error)))
+    page.on("request", lambda request: asked.append(request.url))
+    page.goto(index.as_uri())
+    yield page
+    context.close()
+    assert said == []
+    assert [url for url in asked if not url.startswith(index.parent.as_uri())] == []
+    assert asked
+
+
+def listed(page: Any, column: str = "defense") -> list[str]:
+    """What stands in a column of the rows that are shown, from top to bottom."""
+    cells = page.locator(f'.board:visible tbody tr:visible [data-column="{column}"]')
+    return [cell.get_attribute("data-value") for cell in cells.all()]
+
+
+def head(page: Any, label: str) -> Any:
+    return page.locator(".board:visible thead").get_by_role("button", name=label, exact=True)
+
+
+def dialog(page: Any) -> Any:
+    return page.locator("dialog[open]")
+
+
+LDP4, LDP16 = "ldp:epsilon=4,subset_size=2", "ldp:epsilon=16,subset_size=2"
+
+
+def test_it_opens_ranked_with_the_strongest_attack_on_each(page: Any) -> None:
+    defenses = listed(page)
+    assert defenses[:4] == [LDP4, LDP16, "affine:dim=4", "none"]
+    assert defenses[4].startswith('">')
+    assert defenses[5:] == ["new"]
+    assert listed(page, "rank") == ["1.0", "2.0", "3.0", "4.0", "5.0", ""]
+    assert listed(page, "attack")[2] == "nearest"
+    assert page.locator("tr:visible .note", has_text="unranked: no adapted attacker").count() == 1
+
+
+def test_sorting_by_a_column_both_ways_with_what_is_missing_last(page: Any) -> None:
+    head(page, "ε/descriptor").click()
+    assert listed(page, "epsilon_descriptor") == ["4.0", "16.0", "", "", "", ""]
+    assert page.locator('.board:visible th[aria-sort="ascending"]').inner_text().strip().startswith("ε/descriptor")
+    head(page, "ε/descriptor").click()
+    assert listed(page, "epsilon_descriptor") == ["16.0", "4.0", "", "", "", ""]
+    head(page, "SSIM").click()
+    scores = [float(value) for value in listed(page, "ssim")]
+    assert scores == sorted(scores)
+    assert listed(page)[0] == "new"  # an unranked one is first only when it is asked for
+    head(page, "rank").click()
+    assert listed(page)[0] == LDP4
+
+
+def test_sorting_by_keyboard(page: Any) -> None:
+    head(page, "MAE").focus()
+    page.keyboard.press("Enter")
+    ascending = [float(value) for value in listed(page, "mae")]
+    assert ascending == sorted(ascending)
+    page.keyboard.press("Space")
+    assert [float(value) for value in listed(page, "mae")] == ascending[::-1]
+
+
+def test_filtering_by_words_and_showing_all_attacks(page: Any) -> None:
+    box = page.locator(".board:visible .filter")
+    box.fill("LDP epsilon=16")
+    assert listed(page) == [LDP16]
+    assert page.locator(".board:visible .count").inner_text() == "1 of 9 rows"
+    box.fill("nearest affine")
+    assert listed(page, "attack") == ["nearest"]
+    page.locator(".board:visible .only").uncheck()
+    box.fill("affine")
+    assert listed(page, "attack") == ["nearest", "dia"]
+    box.fill("no such thing")
+    assert listed(page) == []
+    box.fill("")
+    assert len(listed(page)) == 9
+
+
+def test_a_row_opens_its_cell_by_click_and_the_way_back_closes_it(page: Any) -> None:
+    page.locator("tr:visible .open", has_text="ldp").first.click()
+    shown = dialog(page)
+    assert shown.locator("h2").inner_text() == "ldp against dia"
+    assert "bench run --defense ldp:epsilon=4,dictionary=FILE --attack dia:weights=FILE" in shown.locator("pre").inner_text()
+    text = shown.inner_text()
+    assert "ε of a descriptor" in text
+    assert "ε of an image, basic composition" in text
+    assert "404 (400 to 408)" in text  # 4 for each of 101 (100 to 102) keypoints
+    assert "Covered by no ε: the keypoints' positions, the number of keypoints." in text
+    shown.locator("summary").click()
+    assert ENVIRONMENT["source"] in shown.inner_text()
+    page.go_back()
+    assert dialog(page).count() == 0
+
+
+def test_a_row_opens_its_cell_by_keyboard(page: Any) -> None:
+    page.locator(".board:visible .only").focus()
+    for _ in range(40):
+        page.keyboard.press("Tab")
+        if page.evaluate("document.activeElement.className") == "open":
+            break
+    page.keyboard.press("Enter")
+    assert dialog(page).locator("h2").inner_text() == "ldp against dia"
+    page.keyboard.press("Escape")
+    assert dialog(page).count() == 0
+    assert page.evaluate("document.activeElement.className") == "open"  # the reader is where he was
+
+
+def test_a_point_of_the_plot_opens_its_cell(page: Any) -> None:
+    chart = page.locator(".board:visible .chart").first
+    points = chart.locator(".point")
+    assert points.count() == 5
+    assert chart.locator("path.front").first.get_attribute("d").startswith("M")
+    point = chart.get_by_role("link", name="affine:dim=4, rank 3: recall (0.25 m, 2°) 0.5, SSIM 0.6 by nearest")
+    point.click()
+    assert dialog(page).locator("h2").inner_text() == "affine against nearest"
+    page.keyboard.press("Escape")
+    chart.get_by_role("link", name="none, rank 4").focus()
+    page.keyboard.press("Enter")
+    assert dialog(page).locator("h2").inner_text() == "none against dia"
+    dialog(page).get_by_role("link", name="recall (0.25 m, 2°), day").click()  # the other axis
+    assert dialog(page).locator("h2").inner_text() == "none"
+    assert "Localization on gallery" in dialog(page).inner_text()
+
+
+def test_the_slider_uncovers_the_photograph(page: Any) -> None:
+    page.locator("tr:visible .open").first.click()
+    stage, slider = dialog(page).locator(".stage"), dialog(page).locator(".stage input")
+    for name in ("original", "made"):
+        loaded = f"document.querySelector('dialog[open] .{name}').naturalWidth"
+        page.wait_for_function(f"{loaded} === 256")
+
+    def covered() -> str:
+        return str(page.evaluate("getComputedStyle(document.querySelector('dialog[open] .made')).clipPath"))
+
+    assert covered() == "inset(0px 0px 0px 50%)"
+    slider.focus()
+    page.keyboard.press("Home")
+    assert covered() in ("inset(0px 0px 0px 0%)", "inset(0px)")
+    page.keyboard.press("ArrowRight")
+    assert covered() == "inset(0px 0px 0px 1%)"
+    box = stage.bounding_box()
+    page.mouse.move(box["x"] + box["width"] * 0.2, box["y"] + box["height"] / 2)
+    page.mouse.down()
+    page.mouse.move(box["x"] + box["width"] * 0.75, box["y"] + box["height"] / 2)
+    page.mouse.up()
+    share = float(covered().rpartition(" ")[2].removesuffix("%)"))
+    assert share == pytest.approx(75, abs=4)
+    assert slider.get_attribute("aria-valuetext") == f"{share:g} % photograph"
+
+
+def test_another_photograph_can_be_chosen_and_a_lost_one_is_told(page: Any) -> None:
+    page.locator("tr:visible .open").first.click()
+    made = dialog(page).locator(".made")
+    first = made.get_attribute("src")
+    assert dialog(page).locator("output").inner_text() == "0.png · SSIM 0.2"
+    dialog(page).get_by_role("button", name="1.png").click()
+    assert made.get_attribute("src") != first
+    assert made.get_attribute("alt") == "What the attack makes of 1.png"
+    dialog(page).get_by_role("button", name="2.png").click()
+    assert "the photograph is not beside these records" in dialog(page).locator("output").inner_text()
+    assert dialog(page).locator(".stage input").is_disabled()
+    assert not dialog(page).locator(".original").is_visible()
+
+
+def test_a_cell_has_an_address(browser: Any, index: Path) -> None:
+    for page in opened(browser, index, {"width": 1200, "height": 900}):
+        address = page.locator("tr:visible .open").nth(3).get_attribute("href")
+        page.goto("about:blank")
+        page.goto(index.as_uri() + address)
+        assert dialog(page).locator("h2").inner_text() == "none against dia"
+
+
+def test_other_results_are_chosen_from_a_list(page: Any) -> None:
+    page.get_by_label("Results").select_option(index=2)
+    assert page.locator(".board:visible h2").inner_text() == "Localization on gallery"
+    assert listed(page) == ["none", LDP16, "affine:dim=4", LDP4, "new"]  # the most useful first
+    assert page.locator(".board:visible .chart").count() == 0
+
+
+def test_on_a_phone_nothing_runs_over_the_side(phone: Any) -> None:
+    def fits() -> bool:
+        return bool(phone.evaluate("document.documentElement.scrollWidth <= document.documentElement.clientWidth"))
+
+    assert fits()
+    phone.locator(".board:visible .only").uncheck()
+    assert fits()
+    phone.get_by_label("Sort by").locator("visible=true").select_option("ssim")
+    scores = [float(value) for value in listed(phone, "ssim") if value]
+    assert scores == sorted(scores)
+    phone.get_by_label("Sort by").locator("visible=true").select_option("")
+    phone.locator("tr:visible .open").first.click()
+    assert phone.evaluate("(box => box.scrollWidth <= box.clientWidth)(document.querySelector('dialog[open]'))")
+    assert dialog(phone).locator(".stage").bounding_box()["width"] <= 360
+    phone.get_by_role("button", name="Close").click()
+    phone.get_by_label("Results").select_option(index=1)  # whose name is long, and one word
+    assert fits()
+
+
+def test_strings_of_users_are_text(page: Any) -> None:
+    page.locator(".board:visible .only").uncheck()
+    page.locator(".open", has_text="window.owned").locator("visible=true").first.click()
+    dialog(page).locator("summary").click()
+    text = dialog(page).inner_text()
+    assert HOSTILE in text
+    assert "{{ 7 * 7 }}" in text
+    for number in range(2):
+        page.evaluate("location.hash = ''")
+        page.get_by_label("Results").select_option(index=number)
+    assert page.evaluate("window.owned") is None
+    assert page.locator("script").count() == 1
+    assert page.locator("img[onerror]").count() == 0
+
+
+def test_even_a_script_that_got_in_would_not_run(browser: Any, index: Path, tmp_path: Path) -> None:
+    """The negative control of the escaping: unescaped markup does run a script without the policy, and not with it."""
+    text = index.read_text(encoding="utf-8")
+    policy = next(line for line in text.splitlines() if "Content-Security-Policy" in line)
+    owned = {}
+    for name, changed in (("with", text), ("without", text.replace(policy, ""))):
+        (tmp_path / f"{name}.html").write_text(
+            changed.replace("<main>", "<main><script>window.owned = 1</script>"), encoding="utf-8"
+        )
+        page = browser.new_page()
+        page.goto((tmp_path / f"{name}.html").as_uri())
+        owned[name] = page.evaluate("window.owned")
+        page.close()
+    assert owned == {"with": None, "without": 1}
+
+
+def test_names_of_records_lead_to_no_other_files(tmp_path: Path) -> None:
+    """Somebody's records are shown with the pictures that lie beside them, and with no others."""
+    secret = paint(tmp_path / "secret.png", 1)
+    (record,) = reconstructions(NONE, [0.5])
+    record["unit"] = "../../../secret"
+    folder = fabricated.write(tmp_path / "runs", [record])
+    (folder / "reconstructions" / record["cell_id"]).mkdir(parents=True)
+    assert picture(folder, record).resolve() == secret
+    written = site.write(folder, tmp_path / "site").page
+    assert not (written.parent / "pictures").exists()
+    assert record["cell_id"] == cell_id({"name": "reconstruction"}, NONE, DIA, PHOTOGRAPHS, 0, SETTINGS)
+
+
+def test_it_is_written_alike_again(tmp_path: Path) -> None:
+    records = reconstructions(NONE, [0.8, 0.7]) + reconstructions(ldp(4.0), [0.2, 0.3])
+    folder = fabricated.write(tmp_path / "runs", records)
+    site.write(folder, tmp_path / "site")
+    before = {path: path.read_bytes() for path in (tmp_path / "site").rglob("*") if path.is_file()}
+    assert {path.suffix for path in before} == {".html", ".md", ".csv", ".tex", ".png", ".pdf"}
+    site.write(folder, tmp_path / "site")
+    assert {path: path.read_bytes() for path in (tmp_path / "site").rglob("*") if path.is_file()} == before
