@@ -107,11 +107,11 @@ def find(text: str) -> Suite:
     return found
 
 
-def short_name(text: str) -> str:
-    """What the folder of its results is called: the name, or that of its file or module."""
+def folder(text: str) -> Path:
+    """Where its results lie, unless it is said where: `runs/sweep-` and its name, or those of its file or module and its own."""
     place, colon, attribute = text.rpartition(":")
     stem = Path(place).stem if place.endswith(".py") else place.rpartition(".")[2]
-    return f"{stem}-{attribute}" if colon else text
+    return Path("runs") / f"sweep-{f'{stem}-{attribute}' if colon else text}"
 
 
 def _module(place: str) -> str:

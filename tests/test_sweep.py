@@ -134,7 +134,7 @@ def test_sweep_of_a_suite_of_ones_own_and_again(mine: str, capfd: pytest.Capture
     done, shown, told = bench(capfd, "sweep", mine)
     assert done == 0
     assert "seed 1" in shown
-    out = Path("runs/mine-SUITE")
+    out = Path("runs/sweep-mine-SUITE")
     assert f"written to {out}" in told
     assert [(record["seed"], record["unit"]) for record in lines(out)] == [(s, f"{u}.png") for s in (0, 1) for u in range(3)]
     before = (out / FILE).read_bytes()
@@ -316,7 +316,7 @@ def test_failed_units_and_records_of_other_runs_are_told_apart(
     images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     (images / "bad.jpg").write_bytes(b"no photograph")
-    out = tmp_path / "runs" / "x"
+    out = tmp_path / "runs" / "sweep-x"
     common = (
         "--defense",
         "none",
@@ -360,7 +360,7 @@ def test_a_full_disk_loses_nothing_that_was_written(
     assert ended == 1
     assert "No space left" in told
     assert "run the same command again" in told
-    out = Path("runs/mine-SUITE")
+    out = Path("runs/sweep-mine-SUITE")
     assert lines(out) == written
     assert bench(capfd, "sweep", mine)[0] == 0
     assert lines(out)[:4] == written
@@ -381,7 +381,7 @@ def test_interrupted_sweep_goes_on(mine: str, monkeypatch: pytest.MonkeyPatch, c
     ended, _, told = bench(capfd, "sweep", mine)
     assert ended == 130
     assert "run the same command again to go on" in told
-    assert status(Path("runs/mine-SUITE")).count == Count(done=2, missing=4)
+    assert status(Path("runs/sweep-mine-SUITE")).count == Count(done=2, missing=4)
     assert bench(capfd, "sweep", mine)[0] == 0
     assert len(asked) == 7
     assert isinstance(suite.find(mine), Suite)

@@ -28,7 +28,7 @@ def execute(args: argparse.Namespace) -> int:
     if args.suite is not None and args.results is not None:
         raise UserError("give a suite or --results, not both")
     if args.suite is not None:
-        print_rich(*status.shown(Path("runs") / suite.short_name(args.suite)))
+        print_rich(*status.shown(suite.folder(args.suite)))
     elif args.results is not None:
         print_rich(*status.shown(args.results))
     else:

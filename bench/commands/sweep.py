@@ -42,7 +42,7 @@ def execute(args: argparse.Namespace) -> int:
         raise UserError(f"suite {args.suite!r} has no parts")
     engine = engines.choose(args.workers, args.engine, args.scheduler)
     plans = [runner.prepared(part, engine.describe) for part in chosen.parts]
-    out = args.out or Path("runs") / suite.short_name(args.suite)
+    out = args.out or suite.folder(args.suite)
     pairs = sum(len(plan.cells) for plan in plans)
     records = watching.watched(plans, out, engine, f"{args.suite}: {pairs} pairs")
     units = {unit.name: unit for plan in plans for unit in plan.units}
