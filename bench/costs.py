@@ -33,12 +33,12 @@ LEAST = 0.2  # seconds that a rate is measured for, at least
 class Service:
     """Sizes. The defaults are the paper's, where it states them."""
 
-    keypoints: int = 1000  # of a query; the paper has none
+    keypoints: int = 1000  # of an image; the paper does not say
     words: int = 256_000  # |K|
     subset_size: int = 2  # m of LDP-Feat
     dim: int = 4  # of a subspace
-    database: int = 128_000  # |W| of lifting
-    references: int = 50  # images that a query is matched to; the paper has none
+    database: int = 256_000  # |W| of lifting, which the database attack searches
+    references: int = 20  # images that a query is matched to
     length: int = 128  # of a descriptor, D
 
 

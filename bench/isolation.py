@@ -21,9 +21,11 @@ from typing import Any
 import numpy as np
 from safetensors.numpy import load, save
 
+from bench.datasets.scene import Scene
 from bench.errors import UnitError
 from bench.features.dictionary import Dictionary
-from bench.plugin import Selection, View
+from bench.place import Place
+from bench.plugin import Extractor, Selection, View
 from bench.public import Public
 from bench.types import Knowledge, Release
 
@@ -75,10 +77,21 @@ def _answered(ours: Connection, view: View, rng: np.random.Generator) -> Any:
 
 
 def _known(view: View, what: Knowledge, count: int) -> Any:
+    """What can be sent of the knowledge `what`: no cache, for it may have seen where the secret quantises to."""
     value = view.know(what)
     if what is Knowledge.OTHER_RELEASES:
         return list(value(count))
-    return dataclasses.replace(value) if isinstance(value, Dictionary) else value  # without the index that it may have built
+    if what is Knowledge.TRAINING_IMAGES:
+        return _served(value)
+    if what is Knowledge.MAP:
+        return _served(value.public), value.camera
+    return dataclasses.replace(value) if isinstance(value, Dictionary) else value
+
+
+def _served(public: Public) -> tuple[Scene, Extractor] | None:
+    """The place that there is, without its queries: one of them is the secret."""
+    place = public.place
+    return None if place is None else (dataclasses.replace(place.scene, queries=()), place.extractor)
 
 
 def _carry_out(theirs: Connection) -> None:
@@ -103,11 +116,21 @@ def _carry_out(theirs: Connection) -> None:
 
 def _ask(theirs: Connection, what: Knowledge) -> Any:
     """Knowledge as a `View` gives it."""
-    if what is Knowledge.TRAINING_IMAGES:
-        return Public()  # what everyone can read; the other side's has seen where the secret quantises to
     if what is Knowledge.OTHER_RELEASES:
         return functools.partial(_others, theirs)
-    return _asked(theirs, what, 0)
+    told = _asked(theirs, what, 0)
+    if what is Knowledge.TRAINING_IMAGES:
+        return _public(told)
+    if what is Knowledge.MAP:
+        from bench.localization.server import Server  # it brings COLMAP with it
+
+        return Server(public=_public(told[0]), camera=told[1])
+    return told
+
+
+def _public(served: tuple[Scene, Extractor] | None) -> Public:
+    """What everyone can read."""
+    return Public(place=None if served is None else Place(*served))
 
 
 def _others(theirs: Connection, count: int) -> Iterator[Release]:

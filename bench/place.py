@@ -52,7 +52,8 @@ class Place:
         UserError
             if no point could be triangulated.
         """
-        key = [self.digest, units.fingerprint(self.scene), provenance.source(mapping.__name__, covisible.__name__)]
+        source = provenance.source(mapping.__name__, covisible.__name__)
+        key = [self.digest, units.fingerprint(self.scene.references), source]
         arrays, meta = cache.fetch(maps.KIND, key, lambda: mapping.build(self.scene.references, self.references).to_arrays())
         return maps.from_arrays(arrays, meta)
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from bench.datasets import photographs
 from bench.datasets.photographs import Source
-from bench.datasets.scene import Mask, Pixels, Scene
+from bench.datasets.scene import Mask, Pixels, Scene, SceneImage
 from bench.errors import UserError
 from bench.records import canonical
 from bench.types import Bytes
@@ -78,12 +78,17 @@ def of_queries(dataset: Dataset) -> Collection:
     if not scene.queries:
         raise UserError(f"{scene.name}: the scene has no queries")
     units = (Unit(name=query.name, images=(query.pixels,), condition=query.condition, subject=query) for query in scene.queries)
-    return Collection(name=scene.name, units=tuple(units), scene=scene, beside={"scene": fingerprint(scene)})
+    return Collection(
+        name=scene.name,
+        units=tuple(units),
+        scene=scene,
+        beside={"scene": digest([scene.unit, fingerprint(scene.references), fingerprint(scene.queries)])},
+    )
 
 
-def fingerprint(scene: Scene) -> str:
-    """A digest of all that is known of a scene's images, and of their contents."""
-    images = [
+def fingerprint(images: Sequence[SceneImage]) -> str:
+    """A digest of images of a scene: their contents, and what is known of their cameras and poses."""
+    known = [
         [
             image.name,
             image.condition,
@@ -92,9 +97,9 @@ def fingerprint(scene: Scene) -> str:
             [image.camera.width, image.camera.height, *image.camera.params.tolist()],
             None if image.cam_from_world is None else image.cam_from_world.matrix().tolist(),
         ]
-        for image in (*scene.references, *scene.queries)
+        for image in images
     ]
-    return digest([scene.unit, images])
+    return digest(known)
 
 
 def digest(value: Any) -> str:

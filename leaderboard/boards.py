@@ -1,8 +1,8 @@
 """Records made into boards. What stands on one board may be compared, and nothing else.
 
-All of a board has one schema, task, dataset (by its content, so that another split is another dataset), extractor, metric
-settings and source of this program. Where there are several seeds, each has a board, and the cells that have them all share one
-more, where each unit counts with its mean over the seeds. Runs of one cell in several environments stay apart.
+All of a board has one schema, task with its settings, dataset (by its content, so that another split is another dataset),
+extractor, metric settings and source of this program. Where there are several seeds, each has a board, and the cells that have
+them all share one more, where each unit counts with its mean over the seeds. Runs of one cell in several environments stay apart.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from bench.errors import UserError
 from bench.records import FILE, Record, canonical, short_hash
 from leaderboard.measures import PRIVACY, Measure, measures, summary
 from leaderboard.reproduce.intervals import Interval
-from leaderboard.tables import FIRST, extractor_label, labels
+from leaderboard.tables import FIRST, extractor_label, labels, setting
 
 T = TypeVar("T")
 
@@ -92,12 +92,19 @@ class Board:
         return f"{self.head['task'].capitalize()} on {self.head['dataset']['name']}"
 
     @property
+    def settings(self) -> str:
+        """Those of its task."""
+        told = {name: value for name, value in (self.head.get("task_settings") or {}).items() if value is not None}
+        return ", ".join(f"{name} {setting(value)}" for name, value in told.items())
+
+    @property
     def facts(self) -> list[str]:
         """What all its numbers share."""
         seeds = ", ".join(map(str, self.seeds))
         return [
             f"{len(self.units)} {_noun(self.head['task'], len(self.units))}",
             f"{extractor_label(self.head['dataset']['extractor'])} features",
+            *([self.settings] if self.settings else []),
             f"seed {seeds}" if len(self.seeds) == 1 else f"mean over seeds {seeds}",
             f"source {_digits(self.head['environment']['source'])}",
             f"content {_digits(self.head['dataset']['hash'])}",
@@ -164,7 +171,8 @@ def boards(found: Sequence[Found]) -> list[Board]:
 
 def _comparable(record: Record) -> list[Any]:
     dataset = [record["dataset"][key] for key in ("hash", "extractor")]
-    return [record["schema"], record["task"], dataset, record["metric_settings"], record["environment"]["source"]]
+    task = [record["task"], record.get("task_settings")]  # older records don't tell them
+    return [record["schema"], task, dataset, record["metric_settings"], record["environment"]["source"]]
 
 
 def _cells(found: Sequence[Found]) -> list[list[Found]]:

@@ -33,8 +33,9 @@ def plots(board: Board, found: Sequence[Tradeoff]) -> Iterator[tuple[str, Figure
         yield "attacks", attacks(board, ranked)
     if curves := _curves(ranked):
         yield "epsilon", epsilon(board, curves)
+    several = len({one.served.key for one in found}) > 1
     for one in found:
-        yield "-".join(filter(None, (TRADEOFF, one.condition))), tradeoff(one)
+        yield "-".join(filter(None, (TRADEOFF, one.condition, one.served.key[:8] if several else None))), tradeoff(one)
 
 
 def tradeoff(found: Tradeoff) -> Figure:

@@ -10,7 +10,7 @@ from typing import Any
 
 from bench import fields, registry
 from bench.errors import UserError
-from bench.plugin import Plugin
+from bench.plugin import Defense, Plugin, Task
 from bench.public import ASSETS, SHIPPED
 from bench.records import Record
 from bench.registry import Kind
@@ -18,7 +18,7 @@ from leaderboard.boards import Cell
 
 BUILTIN = "builtin"  # the photographs that need no --images
 Lookup = Callable[[Kind, str], type[Plugin] | None]
-HERE = "reconstruction", "dia"  # the default task, and what paints the descriptors there
+DEFAULT = {"--task": "reconstruction", "--extractor": "sift"}  # of the command line
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,11 @@ def recipe(cell: Cell, lookup: Lookup = installed) -> Recipe:
     """
     head, spec = cell.head, functools.partial(_spec, lookup)
     needs: dict[str, None] = {}
-    options = [("--task", _task(head)), ("--defense", spec(registry.DEFENSE, head["defense"], needs))]
+    task = {"name": head["task"], **(head.get("task_settings") or {})}
+    options = [
+        ("--task", spec(registry.TASK, task, needs)),
+        ("--defense", spec(registry.DEFENSE, head["defense"], needs, _made_there(lookup, head))),
+    ]
     if head["attack"] is not None:
         options.append(("--attack", spec(registry.ATTACK, head["attack"], needs)))
     options.append(("--extractor", spec(registry.EXTRACTOR, head["dataset"]["extractor"], needs)))
@@ -56,8 +60,7 @@ def recipe(cell: Cell, lookup: Lookup = installed) -> Recipe:
         needs[f"{head['dataset']['name']}: a folder of the photographs with the content {head['dataset']['hash']}"] = None
     options += [("--metric", text) for text in _metrics(lookup, head["metric_settings"], needs)]
     seeds = sorted({one.record["seed"] for one in cell.found})
-    default = {"--task": HERE[0], "--extractor": "sift"}
-    words = ["bench run", *(_option(option, text) for option, text in options if default.get(option) != text)]
+    words = ["bench run", *(_option(option, text) for option, text in options if DEFAULT.get(option) != text)]
     return Recipe("\n".join(" ".join([*words, f"--seed {seed}"]) for seed in seeds), tuple(needs))
 
 
@@ -66,10 +69,11 @@ def _option(name: str, text: str) -> str:
     return f"{name}{'=' if text.startswith('-') else ' '}{shlex.quote(text)}"
 
 
-def _task(head: Record) -> str:
-    inversion = (head["attack"] or {}).get("inversion")
-    painter = inversion["name"] if inversion else HERE[1]
-    return str(head["task"]) if painter == HERE[1] else f"{head['task']}:inverter={painter}"
+def _made_there(lookup: Lookup, head: Record) -> str | None:
+    """The field of the defense that is filled in with a dictionary of the place, if the task is about one."""
+    task, defense = lookup(registry.TASK, head["task"]), lookup(registry.DEFENSE, head["defense"]["name"])
+    about_places = task is not None and issubclass(task, Task) and task.places
+    return defense.quantised_by if about_places and defense is not None and issubclass(defense, Defense) else None
 
 
 def _metrics(lookup: Lookup, settings: Mapping[str, Mapping[str, Any]], needs: dict[str, None]) -> Iterator[str]:
@@ -80,8 +84,8 @@ def _metrics(lookup: Lookup, settings: Mapping[str, Mapping[str, Any]], needs: d
             yield _spec(lookup, registry.METRIC, {"name": name, **content}, needs)
 
 
-def _spec(lookup: Lookup, kind: Kind, configuration: Mapping[str, Any], needs: dict[str, None]) -> str:
-    """A plugin as the command line takes it, without the fields that are as they are by default."""
+def _spec(lookup: Lookup, kind: Kind, configuration: Mapping[str, Any], needs: dict[str, None], made: str | None = None) -> str:
+    """A plugin as the command line takes it, without the fields that are as by default; `made` is one that it fills in."""
     plugin = lookup(kind, configuration["name"])
     defaults = fields.defaults(plugin) if plugin else {}
     given = []
@@ -89,7 +93,9 @@ def _spec(lookup: Lookup, kind: Kind, configuration: Mapping[str, Any], needs: d
         if field == "name" or isinstance(value, dict) or (plugin and field not in fields.field_types(plugin)):
             continue  # what other plugins do in its stead is no field
         text = _text(value)
-        if field not in defaults or text != _text(defaults[field]):
+        if field == made and text == "FILE":
+            needs[f"{field} of {configuration['name']} is made from the references of the place, or was a file: {value}"] = None
+        elif field not in defaults or text != _text(defaults[field]):
             given.append(f"{field}={text}")
             if text == "FILE":
                 needs[f"FILE for {field} of {configuration['name']}: {value}"] = None

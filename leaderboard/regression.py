@@ -13,6 +13,7 @@ of the paired differences, at the same level. The floor is what a number may mov
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -61,15 +62,15 @@ def compare(baseline: Iterable[Record], results: Iterable[Record]) -> list[Findi
     names = dict(zip({**after, **before}, labels(heads), strict=True))
     found: list[Finding] = []
     for key, (defense, attack) in names.items():
-        where = {"defense": defense, "attack": attack}
+        finding = functools.partial(Finding, defense=defense, attack=attack)
         if key not in after:
-            found.append(Finding(verdict="missing", **where, told="no results for this cell of the baseline"))
+            found.append(finding(verdict="missing", told="no results for this cell of the baseline"))
         elif key not in before:
-            found.append(Finding(verdict="new", **where, told="the baseline does not have this cell"))
+            found.append(finding(verdict="new", told="the baseline does not have this cell"))
         else:
-            found += _cell(before[key], after[key], where)
+            found += _cell(before[key], after[key], finding)
     order = Verdict.__args__  # type: ignore[attr-defined]
-    return sorted(found, key=lambda finding: order.index(finding.verdict))
+    return sorted(found, key=lambda one: order.index(one.verdict))
 
 
 def tolerance(before: Samples, after: Samples, floor: float) -> float:
@@ -107,13 +108,13 @@ def _configuration(record: Record) -> str:
     return canonical([dataset, *(record.get(part) for part in parts)])
 
 
-def _cell(before: list[Record], after: list[Record], where: Mapping[str, str]) -> Iterator[Finding]:
+def _cell(before: list[Record], after: list[Record], finding: functools.partial[Finding]) -> Iterator[Finding]:
     had, have = _done(before), _done(after)
     lost = sorted(had.keys() - have.keys())
     if lost:
         reasons = {record["unit"]: record["reason"] for record in after if record["status"] != "ok"}
         told = f"{len(lost)} of {len(had)} units: {lost[0]}" + (f": {reason}" if (reason := reasons.get(lost[0])) else "")
-        yield Finding(verdict="missing", **where, told=told)
+        yield finding(verdict="missing", told=told)
     shared = [unit for unit in had if unit in have]
     if not shared:
         return
@@ -125,19 +126,19 @@ def _cell(before: list[Record], after: list[Record], where: Mapping[str, str]) -
         if metric.better == 0 or not units:
             continue
         if _settings(before, metric.name) != _settings(after, metric.name):
-            yield Finding(verdict="missing", **where, metric=metric.name, told="it is measured with other settings")
+            yield finding(verdict="missing", metric=metric.name, told="it is measured with other settings")
             continue
         old, new = ({unit: side[unit] for unit in units} for side in (old, new))
         first, second = _mean(old), _mean(new)
         allowed = tolerance(old, new, ABSOLUTE_FLOOR + RELATIVE_FLOOR * abs(first))
         verdict = _verdict(metric.better * (second - first), allowed, attacked, changed)
-        numbers = {"metric": metric.name, "before": first, "after": second, "tolerance": allowed}
-        yield Finding(verdict=verdict, **where, **numbers, told=_told(verdict, attacked, changed))
-    yield from _promise(had, have, shared, where)
+        told = _told(verdict, attacked, changed)
+        yield finding(verdict=verdict, metric=metric.name, before=first, after=second, tolerance=allowed, told=told)
+    yield from _promise(had, have, shared, finding)
 
 
 def _promise(
-    had: Mapping[str, list[Record]], have: Mapping[str, list[Record]], shared: Sequence[str], where: Mapping[str, str]
+    had: Mapping[str, list[Record]], have: Mapping[str, list[Record]], shared: Sequence[str], finding: functools.partial[Finding]
 ) -> Iterator[Finding]:
     """What is promised of a descriptor: it has no spread, and no tolerance."""
     old, new = (side[shared[0]][0]["privacy"] for side in (had, have))
@@ -146,7 +147,7 @@ def _promise(
         return
     verdict: Verdict = "better" if second < first else "worse"
     told = f"the guarantee was {old['guarantee']}, and is {new['guarantee']}"
-    yield Finding(verdict=verdict, **where, metric=PROMISE, before=first, after=second, tolerance=0.0, told=told)
+    yield finding(verdict=verdict, metric=PROMISE, before=first, after=second, tolerance=0.0, told=told)
 
 
 def _done(records: Iterable[Record]) -> dict[str, list[Record]]:

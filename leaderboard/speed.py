@@ -1,12 +1,14 @@
 """Speed, as ratios of times within one run of pytest-benchmark, against ratios that were found good.
 
-A time means little on another machine, and so does a ratio of two machines' times. In each group one benchmark is the floor, such
-as a bare product of matrices, and the others are divided by it. pytest-benchmark compares times with those of earlier runs
-(`--benchmark-compare`), and knows no ratios within a run.
+A time means little on another machine, and so does a ratio of two machines' times. A group of benchmarks holds floors, such as a
+bare product of matrices or another library's search, and the others are divided by the quickest of them, which is another one on
+another processor. pytest-benchmark compares times with those of earlier runs (`--benchmark-compare`), and knows no ratios within
+a run.
 """
 
 from __future__ import annotations
 
+import functools
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,7 +18,7 @@ from bench.errors import UserError
 from leaderboard.regression import Finding, Verdict
 
 TOLERANCE = 2.0  # times as much as the baseline: what a busy machine makes of it is less
-FLOORS = ("bare_product[float32", "random words")  # what other benchmarks of a group are divided by
+FLOORS = ("bare_product", "random words", "faiss")  # in the names of benchmarks that others are divided by
 
 Ratios = Mapping[str, float]
 
@@ -36,7 +38,7 @@ def read(path: Path) -> Ratios:
 
 
 def ratios(path: Path) -> Ratios:
-    """Shortest time of each benchmark, divided by that of its group's floor, from what `--benchmark-json` wrote.
+    """Shortest time of each benchmark, divided by that of its group's quickest floor, from what `--benchmark-json` wrote.
 
     Raises
     ------
@@ -49,13 +51,12 @@ def ratios(path: Path) -> Ratios:
     groups: dict[str, dict[str, float]] = {}
     for one in found["benchmarks"]:
         groups.setdefault(str(one["group"]), {})[one["name"]] = one["stats"]["min"]
-    return {
-        f"{group}: {name}": time / times[floor]
-        for group, times in groups.items()
-        if (floor := _floor(times)) is not None
-        for name, time in times.items()
-        if name != floor
-    }
+    measured: dict[str, float] = {}
+    for group, times in groups.items():
+        floors = [time for name, time in times.items() if _is_floor(name)]
+        if floors:
+            measured |= {f"{group}: {name}": time / min(floors) for name, time in times.items() if not _is_floor(name)}
+    return measured
 
 
 def compare(baseline: Ratios, measured: Ratios) -> list[Finding]:
@@ -64,16 +65,16 @@ def compare(baseline: Ratios, measured: Ratios) -> list[Finding]:
 
 
 def _finding(name: str, before: float | None, after: float | None) -> Finding:
-    where = {"defense": name, "attack": "its floor"}
+    finding = functools.partial(Finding, defense=name, attack="its floor")
     if before is None or after is None:
-        return Finding(verdict="new" if before is None else "missing", **where)
+        return finding(verdict="new" if before is None else "missing")
     verdict: Verdict = "worse" if after > before * TOLERANCE else "better" if after < before / TOLERANCE else "same"
     allowed = before * (TOLERANCE - 1)
-    return Finding(verdict=verdict, **where, metric="time", before=before, after=after, tolerance=allowed)
+    return finding(verdict=verdict, metric="time", before=before, after=after, tolerance=allowed)
 
 
-def _floor(times: Mapping[str, float]) -> str | None:
-    return next((name for floor in FLOORS for name in sorted(times) if floor in name), None)
+def _is_floor(name: str) -> bool:
+    return any(part in name for part in FLOORS)
 
 
 def _json(path: Path) -> Any:

@@ -107,8 +107,8 @@ def _read(texts: Sequence[bytes]) -> Iterator[Line | Fault]:
             yield Fault(number, f"no JSON: {error}")
             continue
         wrong = sorted(validator.iter_errors(record), key=lambda error: error.json_path)
-        for error in wrong:
-            yield Fault(number, f"{error.json_path.removeprefix('$').lstrip('.') or 'the record'}: {_short(error.message)}")
+        for fault in wrong:
+            yield Fault(number, f"{fault.json_path.removeprefix('$').lstrip('.') or 'the record'}: {_short(fault.message)}")
         if not wrong and (unbounded := _not_finite(record)):
             yield Fault(number, f"{unbounded}: not finite")
         elif not wrong:

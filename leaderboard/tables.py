@@ -50,7 +50,9 @@ class Table:
 
 def tables(records: Iterable[Record]) -> list[Table]:
     """Summarise the latest records, one table for each task, dataset (with its extractor) and seed."""
-    groups = _grouped(latest(records), lambda record: [record["task"], record["dataset"], record["seed"]])
+    groups = _grouped(
+        latest(records), lambda record: [record["task"], record.get("task_settings"), record["dataset"], record["seed"]]
+    )
     return [_table(group) for group in groups]
 
 

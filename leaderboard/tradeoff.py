@@ -45,10 +45,11 @@ class Tradeoff:
         """What was measured on what."""
         here, there = self.attacked.head["dataset"], self.served.head["dataset"]
         condition = f"{self.condition.capitalize()}: " if self.condition else ""
+        how = f" ({self.served.settings})" if self.served.settings else ""
         if here["hash"] == there["hash"]:
-            return f"{condition}{self.privacy.label} and {self.utility.label} on {here['name']}"
+            return f"{condition}{self.privacy.label} and {self.utility.label} on {here['name']}{how}"
         words = "; words of a dictionary are those of each" if any(point.own_words for point in self.points) else ""
-        return f"{condition}{self.privacy.label} on {here['name']}, {self.utility.label} on {there['name']}{words}"
+        return f"{condition}{self.privacy.label} on {here['name']}, {self.utility.label} on {there['name']}{how}{words}"
 
     @property
     def front(self) -> list[Point]:

@@ -1,8 +1,9 @@
 """Records that are made up for tests of what is made from records."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -35,11 +36,12 @@ def record(
     status: str = "ok",
     reason: str | None = None,
     environment: dict[str, Any] = ENVIRONMENT,
+    task_settings: Mapping[str, Any] = MappingProxyType({}),
     settings: dict[str, Any] = SETTINGS,
     **more: Any,
 ) -> dict[str, Any]:
     """One record, as the runner writes it."""
-    cell = cell_id({"name": task}, defense, attack, dataset, seed, settings)
+    cell = cell_id({"name": task, **task_settings}, defense, attack, dataset, seed, settings)
     epsilon = defense.get("epsilon")
     keypoints = metrics.get("keypoints", 100) if status == "ok" else None
     return {
@@ -48,6 +50,7 @@ def record(
         "defense": defense,
         "attack": attack,
         "dataset": dataset,
+        "task_settings": dict(task_settings),
         "metric_settings": settings,
         "seed": seed,
         "cell_id": cell,

@@ -36,8 +36,9 @@ def by_defense(board: Board) -> dict[str, Standing]:
         {"settings": SETTINGS | {"ssim": {"sigma": 1.0}}},
         {"environment": ENVIRONMENT | {"source": "sha256:" + "6" * 64}},
         {"task": "collisions"},
+        {"task_settings": {"inverter": "other"}},
     ],
-    ids=["split", "extractor", "metrics", "source", "task"],
+    ids=["split", "extractor", "metrics", "source", "task", "settings"],
 )
 def test_what_cannot_be_compared_has_a_board_of_its_own(tmp_path: Path, other: dict[str, Any]) -> None:
     found = made(tmp_path, reconstructions(NONE, [0.5]), reconstructions(NONE, [0.9], **other))

@@ -10,11 +10,14 @@ from fabricated import PHOTOGRAPHS, ldp, reconstructions
 from fakes import album
 
 from bench import cli, registry, runner, spec
+from bench.commands import run
+from bench.datasets.gallery import Gallery
 from bench.features.sift import Sift
 from bench.plugin import Attack, Defense, Extractor
 from bench.records import short_hash
 from bench.runner import Asked, Plan
 from bench.tasks.collisions import Collisions
+from bench.tasks.localization import Localization
 from bench.tasks.reconstruction import Reconstruction
 from bench.testing import small_dictionary
 from leaderboard.boards import Cell, Found
@@ -27,12 +30,13 @@ def planned(command: str) -> Plan:
     assert program == "bench"
     args, extra = cli.parser().parse_known_args(words)
     assert not extra
+    task = spec.read(args.task, registry.TASK)
     attacks: list[Attack] = [spec.read(text, registry.ATTACK) for text in args.attack or []]
-    defenses: list[Defense] = [spec.read(text, registry.DEFENSE) for text in args.defense]
+    defenses: list[Defense] = [run._defense(text, task) for text in args.defense]
     pairs = tuple((defense, attack) for defense in defenses for attack in attacks or [None])
     extractor: Extractor = spec.read(args.extractor, registry.EXTRACTOR)
-    task = spec.read(args.task, registry.TASK)
-    return runner.planned(Asked(pairs=pairs, images=args.images, task=task, extractor=extractor, dataset=None, seed=args.seed))
+    dataset = None if args.dataset is None else spec.read(args.dataset, registry.DATASET)
+    return runner.planned(Asked(pairs=pairs, images=args.images, task=task, extractor=extractor, dataset=dataset, seed=args.seed))
 
 
 def written(plan: Plan) -> list[Cell]:
@@ -82,6 +86,21 @@ def test_what_is_as_by_default_is_not_spelt_out(monkeypatch: pytest.MonkeyPatch)
     assert recipe(cell).needs == ()
 
 
+def test_words_of_a_place_are_made_there_again() -> None:
+    tiny = Gallery(width=64, height=48, detail=0.1, views=2, queries=2)
+    ldp = spec.read("ldp:epsilon=9,words=32,dictionary=references", registry.DEFENSE)
+    task = Localization(retrieval="released", trials=100)
+    plan = runner.planned(Asked(pairs=((ldp, None),), images=None, task=task, extractor=Sift(), dataset=tiny, seed=1))
+    (cell,) = written(plan)
+    found = recipe(cell)
+    assert found.command == (
+        "bench run --task localization:retrieval=released,trials=100 --defense ldp:epsilon=9,words=32 "
+        "--dataset gallery:views=2,queries=2,width=64,height=48,detail=0.1 --seed 1"
+    )
+    assert planned(found.command).hash == plan.hash
+    assert any("is made from the references of the place" in line for line in found.needs)
+
+
 def test_files_of_ones_own_are_named_by_their_digest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     own = small_dictionary(tmp_path)
     album(tmp_path / "album")
@@ -121,6 +140,16 @@ def test_a_shell_takes_names_for_names(name: str) -> None:
     assert args.defense == [name]
     assert args.images == Path(name)
     assert args.out is None
+
+
+def test_the_settings_of_a_task_are_told() -> None:
+    settings = {
+        "task": "localization",
+        "task_settings": {"retrieval": "released", "retrieved": 20, "trials": 500},
+        "attack": None,
+    }
+    command = recipe(of(reconstructions({"name": "none"}, [0.5], **settings))).command
+    assert command.startswith("bench run --task localization:retrieval=released,trials=500 --defense none --images photos")
 
 
 def test_the_place_of_a_dataset_is_told_by_its_spec() -> None:

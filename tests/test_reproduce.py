@@ -2,7 +2,7 @@
 
 import csv
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +12,12 @@ import pytest
 from fakes import texture
 from PIL import Image
 
-from bench import cli, progress, registry
+from bench import cache, cli, progress, registry
 from bench.features.sift import Sift
 from bench.plugin import Attack, Defense
 from bench.records import FILE, Record
 from bench.tasks.reconstruction import Reconstruction
-from leaderboard.reproduce import figures, report, run, tables
+from leaderboard.reproduce import command, figures, report, run, tables
 from leaderboard.reproduce.claims import Claim, Verdict, falling, same_order
 from leaderboard.reproduce.profiles import CPU, SMOKE, Materials, Setting
 from leaderboard.reproduce.run import Judged, Ran
@@ -41,8 +41,20 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("reproduce") / "out"
 
 
+PLACE = "gallery:views=8,queries=3,width=320,height=240,rooms=1,detail=0.3"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setenv(cache.VARIABLE, str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
 def reproduce(name: str, images: Path, out: Path, *more: str) -> int:
-    return cli.main(["reproduce", name, "--profile", "smoke", "--images", str(images), "--out", str(out), *more])
+    of_place = name in command.of_places()
+    judged = ("--dataset", PLACE, "--workers", "1") if of_place else ("--images", str(images))
+    return cli.main(["reproduce", name, "--profile", "smoke", *judged, "--out", str(out), *more])
 
 
 def lines(out: Path) -> list[bytes]:
@@ -87,13 +99,13 @@ def test_done_again_nothing_runs_and_all_stays(images: Path, out: Path) -> None:
     assert len(borrowed) == 12
 
 
-def test_figures(images: Path, out: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert reproduce("figures", images, out) == 0
+@pytest.mark.parametrize("name", ["figures", "figure-inlier"])
+def test_figures(name: str, images: Path, out: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert reproduce(name, images, out) == 0
     printed = capsys.readouterr().out
-    for drawing in figures.everything():
-        if drawing.left_out() is not None:
-            assert f"left out: {drawing.name}" in printed
-            continue
+    drawings = [drawing for drawing in figures.everything() if drawing.place == (name != "figures")]
+    assert drawings
+    for drawing in drawings:
         files = sorted((out / "figures").rglob(f"{drawing.name}*"))
         assert {file.suffix for file in files} == {".png", ".pdf"}
         for file in files:
@@ -133,6 +145,8 @@ def test_interrupted_reproduction_goes_on_and_ends_as_if_it_had_not_been(
         (("tableS3", "--images", "nowhere"), "no such folder"),
         (("tableS3", "--database", "nowhere.safetensors"), "nowhere.safetensors"),
         (("tableS3", "--size", "3"), "unknown option '--size'"),
+        (("table2", "--images", "nowhere"), "table2 is about a place: name it with --dataset"),
+        (("table1", "--dataset", "gallery"), "table1 is about photographs: name them with --images"),
         ((), "--what is missing"),
     ],
 )

@@ -119,6 +119,16 @@ def dialog(page: Any) -> Any:
     return page.locator("dialog[open]")
 
 
+def shows(page: Any, title: str) -> None:
+    """The cell of that title is open, or will be in a moment."""
+    playwright.expect(dialog(page).locator("h2")).to_have_text(title)
+
+
+def closed(page: Any) -> None:
+    """No cell is open, or will be in a moment."""
+    playwright.expect(dialog(page)).to_have_count(0)
+
+
 LDP4, LDP16 = "ldp:epsilon=4,subset_size=2", "ldp:epsilon=16,subset_size=2"
 
 
@@ -174,7 +184,7 @@ def test_filtering_by_words_and_showing_all_attacks(page: Any) -> None:
 def test_a_row_opens_its_cell_by_click_and_the_way_back_closes_it(page: Any) -> None:
     page.locator("tr:visible .open", has_text="ldp").first.click()
     shown = dialog(page)
-    assert shown.locator("h2").inner_text() == "ldp against dia"
+    shows(page, "ldp against dia")
     assert "bench run --defense ldp:epsilon=4,dictionary=FILE --attack dia:weights=FILE" in shown.locator("pre").inner_text()
     text = shown.inner_text()
     assert "ε of a descriptor" in text
@@ -184,7 +194,7 @@ def test_a_row_opens_its_cell_by_click_and_the_way_back_closes_it(page: Any) -> 
     shown.locator("summary").click()
     assert ENVIRONMENT["source"] in shown.inner_text()
     page.go_back()
-    assert dialog(page).count() == 0
+    closed(page)
 
 
 def test_a_row_opens_its_cell_by_keyboard(page: Any) -> None:
@@ -194,10 +204,10 @@ def test_a_row_opens_its_cell_by_keyboard(page: Any) -> None:
         if page.evaluate("document.activeElement.className") == "open":
             break
     page.keyboard.press("Enter")
-    assert dialog(page).locator("h2").inner_text() == "ldp against dia"
+    shows(page, "ldp against dia")
     page.keyboard.press("Escape")
-    assert dialog(page).count() == 0
-    assert page.evaluate("document.activeElement.className") == "open"  # the reader is where he was
+    closed(page)
+    page.wait_for_function("document.activeElement.className === 'open'")  # the reader is where he was
 
 
 def test_a_point_of_the_plot_opens_its_cell(page: Any) -> None:
@@ -207,13 +217,14 @@ def test_a_point_of_the_plot_opens_its_cell(page: Any) -> None:
     assert chart.locator("path.front").first.get_attribute("d").startswith("M")
     point = chart.get_by_role("link", name="affine:dim=4, rank 3: recall (0.25 m, 2°) 0.5, SSIM 0.6 by nearest")
     point.click()
-    assert dialog(page).locator("h2").inner_text() == "affine against nearest"
+    shows(page, "affine against nearest")
     page.keyboard.press("Escape")
+    closed(page)
     chart.get_by_role("link", name="none, rank 4").focus()
     page.keyboard.press("Enter")
-    assert dialog(page).locator("h2").inner_text() == "none against dia"
+    shows(page, "none against dia")
     dialog(page).get_by_role("link", name="recall (0.25 m, 2°), day").click()  # the other axis
-    assert dialog(page).locator("h2").inner_text() == "none"
+    shows(page, "none")
     assert "Localization on gallery" in dialog(page).inner_text()
 
 
@@ -262,7 +273,7 @@ def test_a_cell_has_an_address(browser: Any, index: Path) -> None:
         address = page.locator("tr:visible .open").nth(3).get_attribute("href")
         page.goto("about:blank")
         page.goto(index.as_uri() + address)
-        assert dialog(page).locator("h2").inner_text() == "none against dia"
+        shows(page, "none against dia")
 
 
 def test_other_results_are_chosen_from_a_list(page: Any) -> None:

@@ -1,6 +1,7 @@
 """Checking somebody's records: each lie is told with its line, and what is honest passes."""
 
 import copy
+import dataclasses
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -10,13 +11,16 @@ import numpy as np
 import pytest
 from fake_plugins.guess import Guess
 from fake_plugins.peeker import Peeker
-from fakes import album, install
+from fakes import album, install, scene
 
 import bench
 from bench import cli, records
 from bench.features.sift import Sift
 from bench.isolation import isolated
+from bench.localization.server import Server
+from bench.place import Place
 from bench.plugin import View
+from bench.public import Public
 from bench.tasks.reconstruction import Reconstruction
 from bench.testing import small_dictionary
 from bench.types import Knowledge, Subspaces
@@ -240,6 +244,24 @@ def test_the_other_process_does_as_this_one() -> None:
     assert np.array_equal(isolated(summed, there, other), summed(here, one))
     assert here.notes == there.notes == ["a database", "this attack did not declare DATABASE in its `needs`"]
     assert one.random() == other.random()
+
+
+def camera_and_references(view: View, rng: np.random.Generator) -> np.ndarray:
+    served = view.know(Knowledge.MAP)
+    assert not served.place.scene.queries
+    names = [reference.name for reference in served.place.scene.references]
+    return np.array([served.camera.params[0], len(names), names[0].count("/")], np.float32)
+
+
+def test_the_map_comes_without_the_queries(tmp_path: Path) -> None:
+    """One of which is the secret."""
+    whole = scene(tmp_path)
+    public = Public(place=Place(whole, Sift()))
+    asked = seen(frozenset())
+    served = Server(public=public, camera=whole.queries[0].camera)
+    asked = dataclasses.replace(asked, knowledge={Knowledge.MAP: lambda: served})
+    found = isolated(camera_and_references, asked, np.random.default_rng(0))
+    assert found.tolist() == [np.float32(75.1), len(whole.references), 1]
 
 
 def test_errors_come_back() -> None:

@@ -82,6 +82,18 @@ def test_on_other_data_the_words_may_be_that_places_own(tmp_path: Path) -> None:
     assert not joined(tmp_path / "same", reconstructions(ldp(8.0), [0.3]), localizations(own, [1], [None], dataset=same))
 
 
+def test_a_server_that_works_otherwise_has_a_plot_of_its_own(tmp_path: Path) -> None:
+    raw, released = ({"task_settings": {"retrieval": how}} for how in ("raw", "released"))
+    records = reconstructions(NONE, [0.8]), localizations(NONE, [1], [None], **raw), localizations(NONE, [0], [None], **released)
+    found = joined(tmp_path, *records)
+    assert {one.caption: one.points[0].utility.mean for one in found} == {
+        "SSIM on photos, recall (0.25 m, 2°) on gallery (retrieval raw)": 1.0,
+        "SSIM on photos, recall (0.25 m, 2°) on gallery (retrieval released)": 0.0,
+    }
+    names = [name for name, _ in plots.plots(found[0].attacked, found)]
+    assert len(set(names)) == len(names)
+
+
 @pytest.mark.parametrize(
     "other",
     [

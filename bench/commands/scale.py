@@ -32,7 +32,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--subset-size", type=positive, default=2, metavar="M", help="words sent a keypoint (default: %(default)s)"
     )
-    parser.add_argument("--references", type=positive, default=50, metavar="R", help="images to match (default: %(default)s)")
+    parser.add_argument("--references", type=positive, default=20, metavar="R", help="images to match (default: %(default)s)")
     parser.add_argument("--markdown", action="store_true", help="print the table as Markdown")
 
 

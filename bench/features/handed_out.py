@@ -85,7 +85,9 @@ def to_colmap(found: Sequence[Described], out: Path) -> None:
     pycolmap.import_images(out, root, camera_mode=pycolmap.CameraMode.PER_IMAGE, image_names=names)
     with pycolmap.Database.open(out) as database:
         for one in found:
-            number = database.read_image_with_name(one.name).image_id
+            image = database.read_image_with_name(one.name)
+            assert image is not None
+            number = image.image_id
             database.write_keypoints(number, one.keypoints)
             kinds = pycolmap.FeatureExtractorType
             kind = kinds.SIFT if one.descriptors.shape[1] == SIFT else kinds.UNDEFINED

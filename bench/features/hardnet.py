@@ -45,7 +45,7 @@ class HardNet(Extractor):
         found = Sift(max_keypoints=self.max_keypoints).extract(image, source)
         assert found.frames is not None
         rows = _described(image, found.keypoints, found.frames[:, 0], self.weights)
-        keep = rows.any(axis=1)
+        keep = np.asarray(rows.any(axis=1))
         return dataclasses.replace(found, descriptors=unit_rows(rows), codes=None).take(keep)
 
 

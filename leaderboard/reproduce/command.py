@@ -10,10 +10,11 @@ from pathlib import Path
 from rich.text import Text
 
 from bench import engines, threads
+from bench.engines import Engine
 from bench.errors import UserError, unknown
 from bench.plugin import Asset, Dataset, Extractor
 from leaderboard.reproduce import figures, report, run, tables
-from leaderboard.reproduce.drawing import Scene, save
+from leaderboard.reproduce.drawing import Drawing, Scene, save
 from leaderboard.reproduce.profiles import Materials, Setting, profile
 from leaderboard.reproduce.run import Judged
 
@@ -50,17 +51,17 @@ def reproduce(
     UserError
         if a name is misspelt, or a file is missing or does not fit; nothing has been written then.
     """
-    known = tables.everything()
-    if name not in (FIGURES, *known):
-        raise unknown("table", name, [FIGURES, *known])
+    known, drawings = tables.everything(), drawn_by()
+    if name not in {**known, **drawings}:
+        raise unknown("table", name, [*known, *drawings])
     sizes = profile(size)
-    of_place = name in known and known[name].place
+    of_place = name in of_places()
     if of_place and images is not None:
         raise UserError(f"{name} is about a place: name it with --dataset, and give no --images")
     if not of_place and dataset is not None:
         raise UserError(f"{name} is about photographs: name them with --images, and give no --dataset")
     if of_place:
-        judged = run.queries(dataset or sizes.place)
+        judged = run.queries(dataset or (sizes.place if name in known else sizes.pictured))
     else:
         judged = run.choose(images, sizes, sizes.pictures if name == FIGURES else sizes.photographs)
     setting = Setting(
@@ -71,12 +72,25 @@ def reproduce(
         seed=seed,
     )
     folder = out or Path("runs") / f"reproduce-{sizes.name}-{_named(images, judged)}"
-    if name == FIGURES:
-        return _figures(setting, judged, folder)
     engine = engines.choose(workers or (threads.cores() if of_place else 1))
+    if name in drawings:
+        return _figures(name, drawings[name], setting, judged, folder, engine)
     rebuilt = run.rebuild(known[name], setting, judged, folder, engine)
     report.write(rebuilt, folder)
     return Done(out=folder, shown=tuple(report.to_rich(rebuilt)), failed=run.failures(rebuilt.ran))
+
+
+def drawn_by() -> dict[str, tuple[Drawing, ...]]:
+    """The figures that each name of the command stands for: all of photographs for one, and each of a place for itself."""
+    everything = figures.everything()
+    of_place = {f"figure-{drawing.name}": (drawing,) for drawing in everything if drawing.place}
+    return {FIGURES: tuple(drawing for drawing in everything if not drawing.place), **of_place}
+
+
+def of_places() -> set[str]:
+    """What of the command is about the queries of a place."""
+    drawings = {name for name, drawn in drawn_by().items() if any(drawing.place for drawing in drawn)}
+    return drawings | {name for name, table in tables.everything().items() if table.place}
 
 
 def _named(images: Path | None, judged: Judged) -> str:
@@ -85,19 +99,16 @@ def _named(images: Path | None, judged: Judged) -> str:
     return "builtin" if images is None else images.resolve().name
 
 
-def _figures(setting: Setting, judged: Judged, out: Path) -> Done:
-    """Run the rows of all figures, and draw them into `out`/reproduced."""
-    drawings = figures.everything()
-    left_out = {drawing.name: reason for drawing in drawings if (reason := drawing.left_out())}
-    rows = {row.name: row for drawing in drawings if drawing.name not in left_out for row in drawing.rows(setting)}
-    ran = run.execute(list(rows.values()), setting, judged, out, FIGURES)
+def _figures(name: str, drawings: tuple[Drawing, ...], setting: Setting, judged: Judged, out: Path, engine: Engine) -> Done:
+    """Run the rows of these figures, and draw them into `out`/figures."""
+    rows = {row.name: row for drawing in drawings for row in drawing.rows(setting)}
+    ran = run.execute(list(rows.values()), setting, judged, out, name, engine)
     scene = Scene(setting=setting, judged=judged, ran=ran, out=out)
-    shown = [Text(f"left out: {name}: {reason}") for name, reason in left_out.items()]
+    shown = []
     for drawing in drawings:
-        if drawing.name not in left_out:
-            for kind, figure in drawing.draw(scene):
-                files = save(figure, out / FIGURES / f"{drawing.name}-{kind}".removesuffix("-"))
-                shown += [Text(str(file)) for file in files]
+        for kind, figure in drawing.draw(scene):
+            files = save(figure, out / FIGURES / f"{drawing.name}-{kind}".removesuffix("-").replace("/", "-"))
+            shown += [Text(str(file)) for file in files]
     return Done(out=out, shown=tuple(shown), failed=run.failures(ran))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from PIL import Image
 
-from bench.datasets import photographs
-from bench.datasets.photographs import Source
+from bench import units
 from bench.errors import UnitError
 from bench.rundir import picture
 from bench.types import Bytes
@@ -27,6 +26,9 @@ if TYPE_CHECKING:
 FORMATS = {"png": {"Software": None}, "pdf": {"CreationDate": None, "Producer": None}}  # so that a run gives the same files again
 
 
+SSIM = {"SSIM": "ssim"}
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Scene:
     """What a figure is drawn from."""
@@ -36,22 +38,22 @@ class Scene:
     ran: Ran
     out: Path
 
-    def originals(self) -> Iterator[tuple[Source, Bytes]]:
-        """The photographs that can be read, and their pixels."""
-        for source in self.judged.chosen:
+    def originals(self) -> Iterator[tuple[str, Bytes]]:
+        """The names of the units that can be read, and their pixels."""
+        for unit in self.judged.units:
             with contextlib.suppress(UnitError):
-                yield source, photographs.read(source.path).pixels
+                yield unit.name, units.read(unit.images[0])[0]
 
-    def panel(self, row: str, source: Source, title: str = "") -> Panel:
-        """The reconstruction of a photograph in a row of a table, with its SSIM beneath; or why there is none."""
+    def panel(self, row: str, unit: str, title: str = "", shown: Mapping[str, str] = SSIM) -> Panel:
+        """The reconstruction of a unit in a row of a table, with metrics beneath, by label; or why there is none."""
         for record in of(self.ran, row):
             if record["status"] == "n/a":
                 return Panel(None, title, "n/a")
-            if record["unit"] == source.name:
+            if record["unit"] == unit:
                 path = picture(self.out, record)
-                score = record["metrics"].get("ssim")
-                beneath = record["status"] if score is None else f"SSIM {score:.3f}"
-                return Panel(np.asarray(Image.open(path)) if path.is_file() else None, title, beneath)
+                scores = {label: record["metrics"].get(metric) for label, metric in shown.items()}
+                told = ", ".join(f"{label} {score:.3f}" for label, score in scores.items() if score is not None)
+                return Panel(np.asarray(Image.open(path)) if path.is_file() else None, title, told or record["status"])
         return Panel(None, title, "not run")
 
 
@@ -62,7 +64,7 @@ class Drawing:
     name: str
     draw: Callable[[Scene], Iterator[tuple[str, Figure]]]  # yields what is added to the name, and the figure
     rows: Callable[[Setting], tuple[Row, ...]] = field(default=lambda setting: ())
-    left_out: Callable[[], str | None] = field(default=lambda: None)  # why it cannot be drawn here, if it cannot
+    place: bool = False  # whether it is about the queries of a place; such a figure is a command of its own
 
 
 def save(figure: Figure, path: Path) -> list[Path]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -26,6 +27,11 @@ class Profile:
     trials: float  # of RANSAC, as a share of the paper's
     # Fields of attacks that are set for want of time, where an attack has them; otherwise attacks are as they were tuned.
     reduced: Mapping[str, int] = field(default_factory=dict)
+
+    @property
+    def pictured(self) -> Gallery:
+        """The place with as few queries as figures show."""
+        return dataclasses.replace(self.place, queries=self.pictures, night=0.0)
 
 
 # Of the built-in photographs `rocket` has the fewest keypoints.

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from bench import runner
+from bench import runner, units
 from bench.datasets import photographs
 from bench.datasets.photographs import Source
 from bench.engines import HERE, Engine
@@ -16,6 +16,7 @@ from bench.plugin import Dataset, Task
 from bench.progress import Progress
 from bench.records import Record
 from bench.runner import Plan
+from bench.units import Unit
 from leaderboard.reproduce import study
 from leaderboard.reproduce.claims import Cell, Finding, judge
 from leaderboard.reproduce.intervals import Interval, interval, proportion, rank_correlation
@@ -32,6 +33,11 @@ class Judged:
     available: int
     chosen: tuple[Source, ...] = ()  # the photographs
     dataset: Dataset | None = None  # the place
+
+    @property
+    def units(self) -> tuple[Unit, ...]:
+        """What records are about."""
+        return (units.of_photographs(self.chosen) if self.dataset is None else units.of_queries(self.dataset)).units
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

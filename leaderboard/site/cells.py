@@ -129,6 +129,7 @@ def _settings(cell: Cell) -> Iterator[tuple[str, tuple[tuple[str, str], ...]]]:
     parts = {
         "Defense": head["defense"],
         "Attack": head["attack"] or {},
+        "Task": {"name": head["task"], **(head.get("task_settings") or {})},
         "Data": dataset,
         "Extractor": head["dataset"]["extractor"],
         "Metrics": head["metric_settings"],

@@ -18,11 +18,11 @@ TITLES = {"database": "database", "clustering": "clustering", "dia": "DIA", "nea
 def drawn(scene: Scene) -> Iterator[tuple[str, Figure]]:
     for dim in table1.DIMS:
         panels = []
-        for number, (source, original) in enumerate(scene.originals()):
+        for number, (name, original) in enumerate(scene.originals()):
             shown = [
                 Panel(original, "original", ""),
-                scene.panel("raw", source, "raw descriptors"),
-                *(scene.panel(table1.name(attack, dim), source, title) for attack, title in TITLES.items()),
+                scene.panel("raw", name, "raw descriptors"),
+                *(scene.panel(table1.name(attack, dim), name, title) for attack, title in TITLES.items()),
             ]
             panels += shown if number == 0 else [Panel(panel.pixels, "", panel.beneath) for panel in shown]
         yield f"dim{dim}", draw(panels, f"What attacks recover from affine subspaces of dimension {dim}", columns=len(TITLES) + 2)

@@ -20,15 +20,15 @@ SUBSETS = (1, 2, 4)
 def drawn(scene: Scene) -> Iterator[tuple[str, Figure]]:
     factor = scene.setting.profile.scale
     heading = f"DIA on LDP-Feat, |K| = {scale.words(WORDS, factor):,}"
-    for source, original in scene.originals():
+    for name, original in scene.originals():
         panels = []
         for number, epsilon in enumerate(table4.EPSILONS):
             panels.append(Panel(original, "original", "") if number == 0 else Panel(None, "", ""))
             ours = scale.epsilon(epsilon, factor)
             for subset in SUBSETS:
                 title = f"ε = {ours:.2f}, m = {subset}" + ("" if factor == 1 else f" (paper's ε {epsilon})")
-                panels.append(scene.panel(table4.name(WORDS, epsilon, subset), source, title))
-        yield source.name, draw(panels, f"{heading}; {source.name}", columns=1 + len(SUBSETS))
+                panels.append(scene.panel(table4.name(WORDS, epsilon, subset), name, title))
+        yield name, draw(panels, f"{heading}; {name}", columns=1 + len(SUBSETS))
 
 
 DRAWING = Drawing(name="epsilon-grid", draw=drawn, rows=table4.rows)
