@@ -57,3 +57,11 @@ def consistent(first: Doubles, second: Doubles, longer: float, fewest: int, rng:
         kept = np.argsort(-found, kind="stable")[: max(fewest, len(left) // 2)]
         left = left[np.sort(kept)]
     return left
+
+
+def supported(first: Doubles, second: Doubles, trusted: Indices, longer: float) -> Indices:
+    """Rows of the matches near a trusted one, other than themselves, that are displaced like it, ascending. -> (M',)"""
+    places = np.concatenate([first / (NEAR * longer), (second - first) / (ALIKE * longer)], axis=1)
+    counts = np.asarray(cKDTree(places[trusted]).query_ball_point(places, 1.0, p=np.inf, return_length=True))
+    counts[trusted] -= 1
+    return np.flatnonzero(counts > 0)

@@ -1,0 +1,133 @@
+"""Matching: which keypoints of two views of a plane a server brings together, if one view or both are privatised.
+
+With H the homography from the first image to the second, a match (i, j) errs by |H x_i − x_j| pixels. It is right below
+`RIGHT`, and
+
+- mean matching accuracy at t: the share of matches that err by less than t;
+- precision: the share that is right, and so the accuracy at `RIGHT`;
+- recall: of the keypoints of the first image that have a true correspondence, a keypoint of the second that errs by less than
+  `RIGHT`, the share that has a right match.
+
+Where nothing is matched, all are zero. (Mikolajczyk and Schmid, PAMI 2005; Dusmanu et al., CVPR 2019.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from bench import matching, units
+from bench.datasets import homographies
+from bench.datasets.homographies import Pair
+from bench.errors import UnitError, UserError
+from bench.plugin import Attack, Dataset, Defense, Extractor, Outcome, Task, Trial
+from bench.public import Public
+from bench.types import Descriptors, Floats, Indices, Subspaces, WordSets
+from bench.units import Collection, Images, Unit
+
+Doubles = NDArray[np.float64]
+
+RIGHT = 3.0  # pixels
+WITHIN = range(1, 11)  # pixels
+SEED = 0  # of the pairs that are made
+
+
+@dataclass(frozen=True, kw_only=True)
+class Matching(Task):
+    """How well two views of a plane are matched: views of the built-in photographs that are made here, or a folder of HPatches.
+
+    The first image is privatised; the second is not, unless `both` says so.
+    """
+
+    attacked: ClassVar[bool] = False
+
+    both: bool = False  # whether the second image is privatised, too
+    ratio: float = 1.0  # of Lowe's test, for what is mutually nearest; 1 asks for nothing
+    each: int = 4  # pairs made of every built-in photograph
+
+    def __post_init__(self) -> None:
+        if not 0 < self.ratio <= 1:
+            raise UserError(f"matching: ratio must be above 0 and at most 1, got {self.ratio}")
+        if self.each < 1:
+            raise UserError(f"matching: each must be at least 1, got {self.each}")
+
+    def collection(self, images: Images, dataset: Dataset | None) -> Collection:
+        if dataset is not None:
+            raise UserError("matching judges pairs of images and takes no dataset; give --images with a folder of HPatches")
+        if images is None:
+            return _collected("pairs", homographies.made(SEED, self.each))
+        if not isinstance(images, (str, Path)):
+            raise UserError("matching judges pairs of images; give a folder of HPatches")
+        return _collected(Path(images).resolve().name, homographies.hpatches(Path(images)))
+
+    def inapplicable(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> str | None:
+        if issubclass(defense.releases, (Descriptors, Subspaces, WordSets)):
+            return None
+        return f"nothing matches {defense.releases.__name__}"
+
+    def resolved(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> Mapping[str, Any]:
+        return {}
+
+    def judge(self, trial: Trial) -> Outcome:
+        pair = trial.unit.subject
+        if not isinstance(pair, Pair):
+            raise UnitError("matching needs a pair of images with a homography")
+        query, reference = trial.shots
+        second = reference.release if self.both else matching.unprotected(reference.secret, trial.defense, trial.public)
+        found = matching.matches(query.release, second, self.ratio)
+        return Outcome(metrics=accuracy(query.release.keypoints, second.keypoints, pair.homography, found))
+
+
+def accuracy(first: Floats, second: Floats, homography: Doubles, matches: Indices) -> dict[str, float | None]:
+    """What the top of this file defines; recall is None if no keypoint has a true correspondence.
+
+    Parameters
+    ----------
+    first, second : (N, 2), (N', 2) keypoints
+    homography : (3, 3) from the first image to the second
+    matches : (M, 2)
+    """
+    expected = transferred(first, homography)  # (N, 2)
+    errors = np.linalg.norm(expected[matches[:, 0]] - second[matches[:, 1]], axis=1)  # (M,)
+    possible = np.zeros(len(first), dtype=bool)
+    seen = np.isfinite(expected).all(axis=1)
+    possible[seen] = cKDTree(second).query(expected[seen])[0] < RIGHT
+    right = np.zeros(len(first), dtype=bool)
+    right[matches[errors < RIGHT, 0]] = True
+    return {
+        "precision": _share(errors < RIGHT),
+        "recall": float(right[possible].mean()) if possible.any() else None,
+        **{f"mma_{t:02}px": _share(errors < t) for t in WITHIN},
+        "matches": float(len(matches)),
+        "correspondences": float(possible.sum()),
+    }
+
+
+def transferred(points: Floats, homography: Doubles) -> Doubles:
+    """Where points of the first image are in the second; infinite on and beyond the horizon. (N, 2) -> (N, 2)"""
+    lifted = np.concatenate([points, np.ones((len(points), 1))], axis=1, dtype=np.float64) @ homography.T  # (N, 3)
+    depth = np.where(lifted[:, 2:] > 0, lifted[:, 2:], 0.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(depth > 0, lifted[:, :2] / depth, np.inf)
+
+
+def _share(flags: NDArray[np.bool_]) -> float:
+    return float(flags.mean()) if len(flags) else 0.0
+
+
+def _collected(name: str, pairs: Sequence[Pair]) -> Collection:
+    homographies_of = {pair.name: pair.homography.tolist() for pair in pairs}
+    return Collection(
+        name=name,
+        units=tuple(Unit(name=pair.name, images=(pair.first, pair.second), subject=pair) for pair in pairs),
+        beside={"homographies": units.digest(homographies_of)},
+    )
+
+
+PLUGIN = Matching
