@@ -184,7 +184,7 @@ def _columns(table: Table, ran: Ran) -> dict[Cell, pd.Series]:
                 for record in of(ran, row.name)
                 if record["status"] == "ok"
                 and record["metrics"].get(wanted.metric) is not None
-                and wanted.condition in (None, record["condition"])
+                and wanted.condition in (None, record.get("condition"))
             },
             dtype=float,
         )
