@@ -236,13 +236,7 @@ class SelectiveAttack(Attack):
 
     @abstractmethod
     def select(self, view: View, rng: np.random.Generator) -> Selection:
-        """Return the keypoints that it is sure of, and float32 estimates of their descriptors.
-
-        Raises
-        ------
-        UnitError
-            if there is none.
-        """
+        """Return the keypoints that it is sure of, perhaps none, and float32 estimates of their descriptors."""
 
 
 class ImageAttack(Attack):

@@ -158,7 +158,11 @@ def compared(trial: Trial, found: Selection | None, image: Floats | None, notes:
         if metric.compares == "images":
             values[metric.name()] = None if image is None else _measured(metric, truth, image)
         else:
-            described = None if found is None else _measured(metric, trial.secret.descriptors[found.rows], found.descriptors)
+            described = (
+                None
+                if found is None or len(found.rows) == 0
+                else _measured(metric, trial.secret.descriptors[found.rows], found.descriptors)
+            )
             values[metric.name()] = described
     if image is not None and (mask := trial.shots[0].foreground()) is not None:
         values |= parts(trial.metrics, truth, image, mask)
