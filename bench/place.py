@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from functools import cached_property
 
 import numpy as np
@@ -25,7 +26,7 @@ class Place:
     """What is made from the references of a scene, each when it is asked for and kept on disk."""
 
     def __init__(self, scene: Scene, extractor: Extractor) -> None:
-        self.scene = scene
+        self.scene = dataclasses.replace(scene, queries=())  # attackers have the place, and a query is the secret
         self.extractor = extractor
         self._words: dict[str, Indices] = {}  # by the dictionary's digest
         self._bags: dict[str, Bags] = {}

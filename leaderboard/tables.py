@@ -173,8 +173,9 @@ def _table(records: list[Record]) -> Table:
     first = records[0]
     units = {record["unit"] for record in records if record["status"] != "n/a"}
     dataset = first["dataset"]
+    judged = f"{len(units)} {units_of(first['task'], len(units))}{_told(records)}"
     heading = (
-        f"{first['task'].capitalize()} on {dataset['name']} ({len(units)} {units_of(first['task'], len(units))}{_told(records)}), "
+        f"{first['task'].capitalize()} on {dataset['name']} ({judged}), "
         f"{extractor_label(dataset['extractor'])} features, seed {first['seed']}"
     )
     cells = _grouped(records, lambda record: [record["defense"], record["attack"], record["run_hash"]])
