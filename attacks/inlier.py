@@ -34,10 +34,9 @@ class Inlier(SelectiveAttack):
         references = server.seen_in(view.release, view.defense, self.retrieved)
         known, seed = server.dictionary(view.defense), int(rng.integers(2**31))
         found = server.localize(view.release, known, references, matcher, self.trials, seed)
-        if found.estimate is None or not found.estimate.inliers.any():
-            raise UnitError("no keypoint was verified")
-        keypoints = found.correspondences.keypoints[found.estimate.inliers]
-        seen = server.place.map.descriptors[found.correspondences.rows[found.estimate.inliers]]
+        verified = np.zeros(len(found.correspondences), bool) if found.estimate is None else found.estimate.inliers
+        keypoints = found.correspondences.keypoints[verified]
+        seen = server.place.map.descriptors[found.correspondences.rows[verified]]
         rows, first = np.unique(keypoints, return_index=True)
         view.notes.append(f"{len(rows)} keypoints verified")
         return Selection(rows=rows, descriptors=seen[first])

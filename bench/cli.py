@@ -26,6 +26,9 @@ EXAMPLES = """examples:
   bench train --defense ldp --images DIR --out W.safetensors
   bench dataset gallery --layout colmap --out DIR
   bench reproduce table1
+  bench sweep smoke --workers 2
+  bench status
+  bench cache list
   bench audit --defense ldp:epsilon=2,subset_size=2 --words 64 --trials 1000000
   bench budget --image-epsilon 10
 

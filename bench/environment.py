@@ -13,20 +13,24 @@ from pathlib import Path
 from typing import Any
 
 DISTRIBUTION = "feature-privacy-bench"
+# Without `suites`, which say what is run, and have no part in how.
 PACKAGES = ("attacks", "bench", "defenses", "leaderboard", "metrics")
-LIBRARIES = ("numpy", "opencv-python-headless", "pillow", "pycolmap", "scikit-image", "torch")
+LIBRARIES = ("numpy", "opencv-python-headless", "pillow", "poselib", "pycolmap", "scikit-image", "torch")
 
 
 def describe(plugins: Iterable[object]) -> dict[str, Any]:
     """The environment as records hold it. `plugins` are those that take part; their files count as source."""
+    return {"version": version(DISTRIBUTION), "source": source_digest(plugins), **computing()}
+
+
+def computing() -> dict[str, Any]:
+    """All of the environment that numbers may depend on beside our own source."""
     import torch
 
     from bench.device import pick_device, pick_dtype
 
     device = pick_device()
     return {
-        "version": version(DISTRIBUTION),
-        "source": source_digest(plugins),
         "python": platform.python_version(),
         **libraries(),
         "machine": f"{platform.system()} {platform.machine()}",

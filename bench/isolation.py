@@ -89,9 +89,9 @@ def _known(view: View, what: Knowledge, count: int) -> Any:
 
 
 def _served(public: Public) -> tuple[Scene, Extractor] | None:
-    """The place that there is, without its queries: one of them is the secret."""
+    """The place that there is; it has no queries, one of which is the secret."""
     place = public.place
-    return None if place is None else (dataclasses.replace(place.scene, queries=()), place.extractor)
+    return None if place is None else (place.scene, place.extractor)
 
 
 def _carry_out(theirs: Connection) -> None:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 from functools import cached_property
 
 import numpy as np
 
-from bench import cache, pool, spec, units
+from bench import cache, provenance, spec, units
 from bench.datasets.scene import Scene, SceneImage
 from bench.errors import UserError
 from bench.features import build, dictionary, kept
@@ -25,7 +26,7 @@ class Place:
     """What is made from the references of a scene, each when it is asked for and kept on disk."""
 
     def __init__(self, scene: Scene, extractor: Extractor) -> None:
-        self.scene = scene
+        self.scene = dataclasses.replace(scene, queries=())  # attackers have the place, and a query is the secret
         self.extractor = extractor
         self._words: dict[str, Indices] = {}  # by the dictionary's digest
         self._bags: dict[str, Bags] = {}
@@ -35,7 +36,7 @@ class Place:
     def digest(self) -> str:
         """Of what the dictionary is made from and how, but for the number of its words."""
         hashes = [image.pixels.content_hash() for image in self.scene.references]
-        return units.digest(["references", hashes, spec.written(self.extractor), SEED, cache.source(build)])
+        return units.digest(["references", hashes, spec.written(self.extractor), SEED, provenance.source(build.__name__)])
 
     def features(self, image: SceneImage) -> Features:
         """Of a reference or a query."""
@@ -52,7 +53,8 @@ class Place:
         UserError
             if no point could be triangulated.
         """
-        key = [self.digest, units.fingerprint(self.scene.references), cache.source(mapping, covisible)]
+        source = provenance.source(mapping.__name__, covisible.__name__)
+        key = [self.digest, units.fingerprint(self.scene.references), source]
         arrays, meta = cache.fetch(maps.KIND, key, lambda: mapping.build(self.scene.references, self.references).to_arrays())
         return maps.from_arrays(arrays, meta)
 
@@ -77,7 +79,7 @@ class Place:
         UnitError
             if one of them cannot be read.
         """
-        return tuple(pool.extracted(self.extractor, [image.pixels for image in self.scene.references]))
+        return tuple(kept.all_features(self.extractor, [image.pixels for image in self.scene.references]))
 
     def dictionary(self, words: int) -> Dictionary:
         """So many words clustered from the references' descriptors; `WORDS` for 0.

@@ -236,13 +236,7 @@ class SelectiveAttack(Attack):
 
     @abstractmethod
     def select(self, view: View, rng: np.random.Generator) -> Selection:
-        """Return the keypoints that it is sure of, and float32 estimates of their descriptors.
-
-        Raises
-        ------
-        UnitError
-            if there is none.
-        """
+        """Return the keypoints that it is sure of, perhaps none, and float32 estimates of their descriptors."""
 
 
 class ImageAttack(Attack):
@@ -337,6 +331,7 @@ class Trial:
     others: Callable[[int], Iterator[Release]]  # the first so many releases of other photographs
     repeats: tuple[Release, ...]  # further releases of the first image's features
     carry_out: CarryOut = at_once  # where the attack is carried out
+    made_from: Mapping[str, Any] | None = None  # JSON: all that the releases are a function of; None keeps nothing of the trial
 
     @property
     def secret(self) -> Features:
@@ -364,6 +359,7 @@ class Outcome:
     metrics: Mapping[str, float | None]
     image: Floats | None = None  # (H, W, 3) in [0, 1], where one was made
     notes: tuple[str, ...] = ()
+    spared: float = 0.0  # seconds that it would have taken longer, had nothing been kept
 
 
 class Task(Plugin, ABC):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import hashlib
 import json
 import logging
@@ -10,7 +11,7 @@ import math
 import os
 from collections.abc import Iterable
 from dataclasses import dataclass
-from io import RawIOBase
+from io import BufferedReader, RawIOBase
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -47,6 +48,11 @@ def run_hash(cell: str, environment: dict[str, Any]) -> str:
     return short_hash([cell, environment])
 
 
+def key(record: Record) -> tuple[str, str]:
+    """What a record is known by: of two that share it the later one counts."""
+    return record["run_hash"], record["unit"]
+
+
 @dataclass(frozen=True)
 class Contents:
     """What a file of records holds."""
@@ -73,7 +79,7 @@ def read(path: Path) -> Contents:
 
 def latest(records: Iterable[Record]) -> list[Record]:
     """The last record of each unit of each run of a cell."""
-    return list({(record["run_hash"], record["unit"]): record for record in records}.values())
+    return list({key(record): record for record in records}.values())
 
 
 def find(path: str | Path) -> Path:
@@ -108,8 +114,21 @@ def load_records(path: str | Path) -> pd.DataFrame:
     return pd.json_normalize([_with_infinity(record) for record in latest(contents.records)])
 
 
+def locked(path: Path) -> bool:
+    """Whether a process that lives is writing to that file of records."""
+    try:
+        with path.open("rb") as file:
+            return not _lock(file, fcntl.LOCK_SH)
+    except FileNotFoundError:
+        return False
+
+
 class Log:
-    """A file of records, open to append; each record is handed to the system before the next unit begins."""
+    """A file of records, open to append; each record is handed to the system before the next unit begins.
+
+    It is locked while it is open. Whenever its process ends, however that is, the system lifts the lock.
+    `before` is what the file held when it was locked.
+    """
 
     def __init__(self, path: Path) -> None:
         """Open the file, or make it, and cut off what a crash left of a last line.
@@ -117,7 +136,7 @@ class Log:
         Raises
         ------
         UserError
-            if the file cannot be written, or holds something else.
+            if the file cannot be written, holds something else, or another process writes to it.
         """
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -125,7 +144,10 @@ class Log:
         except OSError as error:
             raise UserError(f"--out: cannot write {path}: {error.strerror}") from error
         try:
-            self._file.truncate(read(path).whole)
+            if not _lock(self._file, fcntl.LOCK_EX):
+                raise UserError(f"--out: another process is writing to {path}; wait for it, or name another folder")
+            self.before = read(path)
+            self._file.truncate(self.before.whole)
         except UserError:
             self._file.close()
             raise
@@ -147,6 +169,17 @@ class Log:
         line = json.dumps(record, allow_nan=False).encode() + b"\n"
         if self._file.write(line) != len(line):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def _lock(file: RawIOBase | BufferedReader, how: int) -> bool:
+    """Lock an open file until it is closed; False if another has it open and locked. Where nothing can be locked, all is free."""
+    try:
+        fcntl.flock(file, how | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True
+    return True
 
 
 def _record(path: Path, number: int, line: bytes) -> Record:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from collections.abc import Iterable
 
@@ -70,3 +71,25 @@ def add_seed(parser: argparse.ArgumentParser, what: str = "everything random") -
 def add_extractor(parser: argparse.ArgumentParser) -> None:
     """Declare --extractor."""
     parser.add_argument("--extractor", metavar="SPEC", default="sift", help="what makes the features (default: %(default)s)")
+
+
+def add_engine(parser: argparse.ArgumentParser) -> None:
+    """Declare --workers, --engine and --scheduler."""
+    parser.add_argument("--workers", type=whole, default=1, metavar="N", help="processes of this machine (default: %(default)s)")
+    parser.add_argument("--engine", metavar="NAME", default="processes", help="processes or dask (default: %(default)s)")
+    parser.add_argument("--scheduler", metavar="ADDRESS", help="of dask, such as tcp://127.0.0.1:8786 (docs/sweeps.md)")
+
+
+def size(text: str) -> int:
+    """Read a number of bytes: `500`, `20kB`, `1.5GB`."""
+    found = re.fullmatch(r"([0-9.]+)\s*([kMGT]?)B?", text.strip())
+    try:
+        return round(float(found[1]) * 1000 ** " kMGT".index(found[2] or " ")) if found else int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected a size such as 20MB, not {text!r}") from None
+
+
+def told_size(count: int) -> str:
+    """A number of bytes for people."""
+    power = min(3, max(0, (len(str(count)) - 1) // 3))
+    return f"{count / 1000**power:.3g} {('B', 'kB', 'MB', 'GB')[power]}"

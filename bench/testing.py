@@ -10,15 +10,17 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from bench import cache, tensorfile
 from bench.datasets import photographs
 from bench.datasets.photographs import SIDE
-from bench.features import dictionary
+from bench.features import dictionary, kept
 from bench.kernels.search import unit_rows
 from bench.plugin import (
     Asset,
@@ -99,15 +101,21 @@ def check_applicability(attack: Attack, defense: Defense, extractor: Extractor, 
 def check_attack(attack: Attack, defense: Defense, extractor: Extractor, secret: Features) -> None:
     """An attack that applies returns what it should, and knows the release and public knowledge alone.
 
-    What it returns must be bit-identical when the secret and the caches are overwritten after the release.
+    What it returns must be bit-identical when the secret and the caches are overwritten after the release, those on disk too.
     """
+    with tempfile.TemporaryDirectory() as folder, cache.within(Path(folder)):
+        _check_attack(attack, defense, extractor, secret)
+
+
+def _check_attack(attack: Attack, defense: Defense, extractor: Extractor, secret: Features) -> None:
     cached: list[Indices] = []
 
     def quantise(known: dictionary.Dictionary, rows: Any) -> Indices:
-        cached.append(known.index.nearest(rows))
+        cached.append(kept.nearest_words(known, rows))
         return cached[-1]
 
     public = Public(quantise)
+    cache.fetch(kept.KIND, "the secret", lambda: (kept.to_arrays(secret), {"size": list(secret.size)}))
     mine = copy.deepcopy(secret)
     strangers = [example_features(len(secret), seed) for seed in range(5, 8)]
 
@@ -137,6 +145,8 @@ def check_attack(attack: Attack, defense: Defense, extractor: Extractor, secret:
     assert first.dtype == np.float32
     for array in (*_arrays(mine), *cached):
         array[...] = 0
+    for entry in cache.entries():
+        overwrite(entry.path, entry.kind)
     public.forget()
     assert np.array_equal(first, _estimate(trial)), "the attack saw more than the release"
 
@@ -177,6 +187,12 @@ def check_extractor(extractor: Extractor, image: np.ndarray, source: Path | None
     np.testing.assert_allclose(np.linalg.norm(features.descriptors, axis=1), 1, atol=TOLERANCE)
     assert features.codes is None or same_array(unit_rows(features.codes), features.descriptors)
     assert same(features, features.by_position()), "the order of keypoints would tell what is not released"
+
+
+def overwrite(file: Path, kind: str) -> None:
+    """Put zeros in the place of all numbers of a file of arrays, as if they were what had been written."""
+    arrays, meta, _ = tensorfile.load(file, kind)
+    tensorfile.save(file, kind, {name: np.zeros_like(array) for name, array in arrays.items()}, meta)
 
 
 def check_task(task: Task, defense: Defense, extractor: Extractor, secret: Features) -> None:

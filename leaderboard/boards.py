@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 import logging
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -19,7 +19,7 @@ from bench.errors import UserError
 from bench.records import FILE, Record, canonical, short_hash
 from leaderboard.measures import PRIVACY, Measure, measures, summary
 from leaderboard.reproduce.intervals import Interval
-from leaderboard.tables import FIRST, extractor_label, labels, setting
+from leaderboard.tables import FIRST, extractor_label, labels, setting, units_of
 
 T = TypeVar("T")
 
@@ -102,7 +102,7 @@ class Board:
         """What all its numbers share."""
         seeds = ", ".join(map(str, self.seeds))
         return [
-            f"{len(self.units)} {_noun(self.head['task'], len(self.units))}",
+            f"{len(self.units)} {units_of(self.head['task'], len(self.units))}",
             f"{extractor_label(self.head['dataset']['extractor'])} features",
             *([self.settings] if self.settings else []),
             f"seed {seeds}" if len(self.seeds) == 1 else f"mean over seeds {seeds}",
@@ -225,14 +225,6 @@ def _grouped(items: Iterable[T], key: Callable[[T], Any]) -> list[list[T]]:
     for item in items:
         groups.setdefault(canonical(key(item)), []).append(item)
     return list(groups.values())
-
-
-def _noun(task: str, count: int) -> str:
-    noun = _NOUNS.get(task, "photograph")
-    return noun if count == 1 else {"query": "queries"}.get(noun, noun + "s")
-
-
-_NOUNS: Mapping[str, str] = {"localization": "query", "structure": "scene", "matching": "image pair"}
 
 
 def _digits(digest: str) -> str:

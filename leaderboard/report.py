@@ -10,7 +10,7 @@ from PIL import Image
 from bench import units
 from bench.errors import UnitError
 from bench.records import Record
-from bench.runner import picture
+from bench.rundir import picture
 from bench.units import Unit
 from leaderboard import figures, tables
 

@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from bench import fields, records, registry, runner, spec
+from bench import fields, records, registry, runner, spec, trials
 from bench.datasets.photographs import folder
 from bench.errors import UnitError, UserError
 from bench.isolation import isolated
@@ -26,6 +26,7 @@ from bench.public import ASSETS, REFERENCES, SHIPPED
 from bench.records import EVERY_UNIT, Record
 from bench.registry import Kind
 from bench.runner import Asked, Cell, Plan
+from bench.trials import Trials
 from bench.units import Images
 from leaderboard.regression import ABSOLUTE_FLOOR, RELATIVE_FLOOR
 
@@ -250,7 +251,7 @@ def _impossible(cell: Cell, members: Sequence[Line], plan: Plan) -> Iterator[Fau
             yield Fault(line.number, f"status: the pair {told}")
         if record["unit"] not in (names if cell.reason is None else {EVERY_UNIT}):
             yield Fault(line.number, f"unit: the dataset has no {record['unit']!r}")
-        right = runner.privacy(cell, record["privacy"]["keypoints"])
+        right = trials.privacy(cell, record["privacy"]["keypoints"])
         for name, value in right.items():
             if not _close(record["privacy"][name], value):
                 yield Fault(line.number, f"privacy.{name}: is {_short(record['privacy'][name])}, should be {_short(value)}")
@@ -285,7 +286,7 @@ def _again(done: Sequence[tuple[Plan, Cell, Line]], sample: int, seed: int) -> I
 def _made_again(plan: Plan, cell: Cell, name: str) -> Record | None:
     unit = next((unit for unit in plan.units if unit.name == name), None)
     apart = dataclasses.replace(plan, carry_out=isolated)
-    return None if unit is None or cell.reason else next(iter(runner.unit_records(apart, unit, [cell], None)))
+    return None if unit is None or cell.reason else Trials(apart).carry_out(cell, unit).record
 
 
 def _compared(line: Line, again: Record | None) -> Iterator[Fault]:

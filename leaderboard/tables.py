@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -49,11 +49,20 @@ class Table:
 
 
 def tables(records: Iterable[Record]) -> list[Table]:
-    """Summarise the latest records, one table for each task, dataset (with its extractor) and seed."""
+    """Summarise the latest records, one table for each task, dataset (with its extractor), seed and condition."""
     groups = _grouped(
         latest(records), lambda record: [record["task"], record.get("task_settings"), record["dataset"], record["seed"]]
     )
-    return [_table(group) for group in groups]
+    return [_table(part) for group in groups for part in _by_condition(group)]
+
+
+def units_of(task: str, count: int) -> str:
+    """What the records of a task are about, in words."""
+    noun = _UNITS.get(task, "photograph")
+    return noun if count == 1 else {"query": "queries"}.get(noun, noun + "s")
+
+
+_UNITS: Mapping[str, str] = {"localization": "query", "structure": "scene", "matching": "image pair"}
 
 
 def labels(pairs: Sequence[tuple[Configuration, Configuration]]) -> list[tuple[str, str]]:
@@ -145,12 +154,28 @@ def extractor_label(configuration: dict[str, Any]) -> str:
     return configuration["name"] + words.get(configuration.get("upright"), "")  # type: ignore[arg-type]
 
 
+def _by_condition(records: list[Record]) -> list[list[Record]]:
+    """Records of units of one condition each, with those that hold for every unit."""
+    conditions = dict.fromkeys(record.get("condition") for record in records if record["status"] != "n/a") or {None: None}
+    return [
+        [record for record in records if record["status"] == "n/a" or record.get("condition") == condition]
+        for condition in conditions
+    ]
+
+
+def _told(records: list[Record]) -> str:
+    """Under which condition, where there is one."""
+    conditions = {record["condition"] for record in records if record.get("condition") is not None}
+    return f" by {conditions.pop()}" if conditions else ""
+
+
 def _table(records: list[Record]) -> Table:
     first = records[0]
     units = {record["unit"] for record in records if record["status"] != "n/a"}
     dataset = first["dataset"]
+    judged = f"{len(units)} {units_of(first['task'], len(units))}{_told(records)}"
     heading = (
-        f"{first['task'].capitalize()} on {dataset['name']} ({len(units)} {'photograph' if len(units) == 1 else 'photographs'}), "
+        f"{first['task'].capitalize()} on {dataset['name']} ({judged}), "
         f"{extractor_label(dataset['extractor'])} features, seed {first['seed']}"
     )
     cells = _grouped(records, lambda record: [record["defense"], record["attack"], record["run_hash"]])

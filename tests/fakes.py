@@ -20,6 +20,7 @@ FAKES = {
     "feature_privacy.attacks": {
         "painter": "fake_plugins.painter:PLUGIN",
         "guess": "fake_plugins.guess:PLUGIN",
+        "fatal": "fake_plugins.fatal:PLUGIN",
         "glimpse": "fake_plugins.glimpse:PLUGIN",
     },
     "feature_privacy.defenses": {"broken": "fake_plugins.broken:PLUGIN"},

@@ -10,6 +10,7 @@ from fakes import album
 from PIL import Image
 from scipy.spatial.distance import pdist
 
+from bench import cache
 from bench.datasets import captured
 from bench.datasets.captured import Captured
 from bench.datasets.gallery import Gallery
@@ -40,7 +41,6 @@ def dataset(photographs: Path, truth: list[SceneImage], tmp_path_factory: pytest
     length = float(np.linalg.norm(centres(truth)[0] - centres(truth)[-1]))
     return Captured(
         path=photographs,
-        cache=tmp_path_factory.mktemp("cache"),
         held_out=4,
         first="0.png",
         second=f"{COUNT - 1}.png",
@@ -100,9 +100,10 @@ def test_unit_must_be_fixed_by_two_photographs_that_have_a_place(dataset: Captur
 
 
 def test_photographs_of_nothing_in_common(tmp_path: Path) -> None:
+    before = [entry for entry in cache.entries() if entry.kind == "models"]
     with pytest.raises(UserError, match="structure from motion found no model; do the photographs overlap"):
-        Captured(path=album(tmp_path / "noise", 3), cache=tmp_path / "cache").scene()
-    assert not (tmp_path / "cache").exists()
+        Captured(path=album(tmp_path / "noise", 3)).scene()
+    assert [entry for entry in cache.entries() if entry.kind == "models"] == before
 
 
 @pytest.mark.parametrize("fields", [{"held_out": 1}, {"length": 0.0}, {"length": float("nan")}])

@@ -58,6 +58,7 @@ def test_run_writes_everything_and_prints_the_table(bench: Bench, images: Path, 
     assert f"written to {out}" in told
     assert "\x1b" not in shown + told
     assert {path.name for path in out.iterdir()} == {
+        "plan.json",
         "records.jsonl",
         "report.md",
         "report.csv",

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from fakes import texture
 
-from bench import fields, registry, spec
+from bench import cache, fields, registry, spec, tensorfile
 from bench.datasets import photographs
+from bench.features import dictionary
 from bench.features.sift import Sift
+from bench.kernels.search import unit_rows
 from bench.plugin import Attack, Defense, Extractor, Metric, Privacy, View
 from bench.public import Public
 from bench.registry import Kind
@@ -24,6 +26,7 @@ from bench.testing import (
     small_dictionary,
 )
 from bench.types import Descriptors, Features
+from defenses.ldp import LDP
 
 
 def plugins(kind: Kind) -> Any:
@@ -130,3 +133,23 @@ def test_peeking_attack_is_noticed() -> None:
 
     with pytest.raises(AssertionError, match="saw more"):
         check_attack(Peeking(), Leaky(), Sift(), example_features())
+
+
+def test_attack_that_rummages_in_what_is_kept_on_disk_is_noticed(tmp_path: Path) -> None:
+    from fake_plugins.guess import Guess
+
+    class Rummaging(Guess):
+        def recover(self, view: View, rng: np.random.Generator) -> np.ndarray:
+            (features,) = (entry.path for entry in cache.entries() if entry.kind == "features")
+            return unit_rows(tensorfile.load(features, "features")[0]["descriptors"] + np.float32(1e-3))
+
+    class Quantised(Guess):
+        def recover(self, view: View, rng: np.random.Generator) -> np.ndarray:
+            (words,) = (entry.path for entry in cache.entries() if entry.kind == "words")
+            found = tensorfile.load(words, "words")[0]["words"]
+            return unit_rows(dictionary.load(Path(small)).words[found])
+
+    small = small_dictionary(tmp_path)
+    for attack in (Rummaging(), Quantised()):
+        with pytest.raises(AssertionError, match="saw more"):
+            check_attack(attack, LDP(dictionary=small), Sift(), example_features())

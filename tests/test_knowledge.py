@@ -13,7 +13,7 @@ from bench.features.sift import Sift
 from bench.plugin import Asset, Attack, DescriptorAttack, Trial
 from bench.population import Population
 from bench.public import Public
-from bench.runner import randomness
+from bench.randomness import randomness
 from bench.tasks.reconstruction import RELEASES, Reconstruction, view
 from bench.testing import NO_UNIT, shot
 from bench.types import Features, Floats, Knowledge, Release, Subspaces

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from fakes import album
 
-from bench import runner
+from bench import randomness as seeds
 from bench.datasets.photographs import Source, folder
 from bench.features.sift import Sift
 from bench.kernels.search import unit_rows
@@ -16,7 +16,7 @@ from defenses.none import Undefended
 
 
 def randomness(*parts: object) -> np.random.Generator:
-    return runner.randomness("test", *parts)
+    return seeds.randomness("test", *parts)
 
 
 @pytest.fixture

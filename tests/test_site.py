@@ -10,7 +10,7 @@ import pytest
 from fabricated import DIA, ENVIRONMENT, PHOTOGRAPHS, SETTINGS, inapplicable, ldp, localizations, paint, reconstructions
 
 from bench.records import cell_id
-from bench.runner import picture
+from bench.rundir import picture
 from leaderboard import site
 from leaderboard.report import photograph
 

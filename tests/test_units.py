@@ -84,6 +84,13 @@ def test_words_of_the_references_are_clustered_to_the_number_asked_for(tmp_path:
         Public().dictionary("references")
 
 
+def test_a_place_keeps_no_query_for_attackers_to_find(tmp_path: Path) -> None:
+    whole = scene(tmp_path / "scene")
+    assert whole.queries
+    assert Place(whole, Sift()).scene.queries == ()
+    assert Place(whole, Sift()).scene.references == whole.references
+
+
 def test_a_scene_without_queries_is_a_mistake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bare: Scene = dataclasses.replace(scene(tmp_path / "scene"), queries=())
     monkeypatch.setattr(Gallery, "scene", lambda self: bare)

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-PACKAGES = ("bench", "defenses", "attacks", "metrics", "leaderboard")
+PACKAGES = ("bench", "defenses", "attacks", "metrics", "leaderboard", "suites")
 
 
 @pytest.fixture(scope="module")

@@ -37,6 +37,7 @@ def execute(args: argparse.Namespace) -> int:
     from bench.features import handed_out
     from bench.progress import Progress
     from bench.tasks.reconstruction import Reconstruction
+    from bench.trials import Trials
 
     if args.layout not in handed_out.LAYOUTS:
         raise UserError(f"--layout {args.layout}: there is {' and '.join(handed_out.LAYOUTS)}")
@@ -55,12 +56,13 @@ def execute(args: argparse.Namespace) -> int:
     (cell,) = plan.cells
     if attack is not None and cell.reason is not None:
         raise UserError(cell.reason)
+    trials = Trials(plan)
     found, failed = [], 0
     with Progress(f"exporting for {args.layout}", len(plan.units)) as progress:
         for unit in plan.units:
             try:
                 path = args.images / unit.name
-                found.append(handed_out.described(runner.trial(plan, cell, unit), path, attack))
+                found.append(handed_out.described(trials.trial(cell, unit), path, attack))
             except UnitError as error:
                 failed += 1
                 progress.say(f"bench: failed: {unit.name}: {error}")

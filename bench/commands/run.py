@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bench.errors import UserError
-from bench.terminal import DONE, FAILED, add_extractor, add_seed, print_rich, say, whole
+from bench.terminal import DONE, FAILED, add_engine, add_extractor, add_seed, say
 
 if TYPE_CHECKING:
     from bench.plugin import Defense, Metric, Task
@@ -45,7 +44,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--dataset", metavar="SPEC", help="the place that a task is about (default: the task's; bench list datasets)"
     )
-    parser.add_argument("--workers", type=whole, default=1, metavar="N", help="processes (default: %(default)s)")
+    add_engine(parser)
     add_seed(parser)
     parser.add_argument(
         "--out", type=Path, metavar="DIR", help="folder for the results; resumed if it exists (default: in runs/)"
@@ -54,38 +53,29 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(args: argparse.Namespace) -> int:
-    from bench import pool, registry, runner, spec
-    from bench.progress import Progress
+    from bench import engines, registry, runner, spec, watching
+    from bench.runner import Asked
     from leaderboard import report
 
-    pool.share(args.workers)
+    engine = engines.choose(args.workers, args.engine, args.scheduler)
     task = spec.read(args.task, registry.TASK)
     _check_attacks(task, args.attack)
-    plan = runner.prepare(
-        [_defense(text, task) for text in args.defense],
-        [spec.read(text, registry.ATTACK) for text in args.attack or []],
-        args.images,
-        extractor=spec.read(args.extractor, registry.EXTRACTOR),
+    defenses = [_defense(text, task) for text in args.defense]
+    attacks = [spec.read(text, registry.ATTACK) for text in args.attack or []]
+    asked = Asked(
+        pairs=runner.crossed(task, defenses, attacks),
+        images=args.images,
         task=task,
+        extractor=spec.read(args.extractor, registry.EXTRACTOR),
         dataset=None if args.dataset is None else spec.read(args.dataset, registry.DATASET),
         seed=args.seed,
-        metrics=[_metric(text) for text in args.metric],
+        metrics=tuple(_metric(text) for text in args.metric),
     )
+    plan = runner.prepared(asked, engine.describe)
     out = args.out or Path("runs") / _run_name(plan)
-    records: list[Record] = []
-    noted: set[str] = set()
-    with Progress(f"{plan.task.name()}: {len(plan.units)} units, {len(plan.cells)} pairs", len(plan)) as progress:
-        for record in runner.execute(plan, out, args.workers):
-            records.append(record)
-            progress.advance(note=record["unit"])
-            for note in record["notes"]:
-                if note not in noted:
-                    progress.say(f"bench: {note}")
-            noted.update(record["notes"])
-            if record["status"] == "failed":
-                progress.say(f"bench: failed: {record['unit']}, {record['defense']['name']}: {record['reason']}")
+    records = watching.watched([plan], out, engine, f"{task.name()}: {len(plan.units)} units, {len(plan.cells)} pairs")
     report.write(records, plan.units, out)
-    _print_records(records) if args.json else _print_tables(records)
+    _print_records(records) if args.json else watching.print_tables(records)
     say(DONE, f"written to {out}")
     return FAILED if any(record["status"] == "failed" for record in records) else DONE
 
@@ -128,9 +118,3 @@ def _run_name(plan: Plan) -> str:
 def _print_records(records: list[Record]) -> None:
     for record in records:
         print(json.dumps(record, allow_nan=False))
-
-
-def _print_tables(records: list[Record]) -> None:
-    from leaderboard import tables
-
-    print_rich(*(tables.to_rich(table, foldable=sys.stdout.isatty()) for table in tables.tables(records)))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 from bench.terminal import DONE, add_extractor, add_seed, whole, wholes
 
@@ -45,6 +46,7 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(args: argparse.Namespace) -> int:
+    from attacks.inversion import kept
     from attacks.inversion.network import Shape
     from attacks.inversion.train import Training, train
     from bench import registry, spec
@@ -52,22 +54,25 @@ def execute(args: argparse.Namespace) -> int:
     from bench.plugin import Asset
 
     plugin, given = spec.parse(args.defense, registry.DEFENSE)
+    defense = spec.build(plugin, given)
+    served = {name: settings for name, settings in plugin.serves.items() if name not in given}
     photographs, validation = held_out(folder(args.images), args.validation)
     chosen = {name: value for name in ("steps", "batch", "rate", "seed") if (value := getattr(args, name)) is not None}
-    meta = train(
-        spec.build(plugin, given),
-        {name: settings for name, settings in plugin.serves.items() if name not in given},
-        photographs=photographs,
-        validation=validation,
-        out=args.out,
-        extractor=spec.read(args.extractor, registry.EXTRACTOR),
-        crossfit=[Asset(file) for file in args.crossfit],
-        start=args.start,
-        encoding=args.encoding,
-        widths=args.widths or Shape.widths,
-        training=Training(**chosen),
-        log=args.log,
-    )
+    asked: dict[str, Any] = {
+        "photographs": photographs,
+        "validation": validation,
+        "extractor": spec.read(args.extractor, registry.EXTRACTOR),
+        "crossfit": [Asset(file) for file in args.crossfit],
+        "start": args.start,
+        "encoding": args.encoding,
+        "widths": args.widths or Shape.widths,
+        "training": Training(**chosen),
+    }
+    key = kept.key(defense, served, **asked)
+    meta = kept.fetch(key, args.out)
+    if meta is None:
+        meta = train(defense, served, out=args.out, log=args.log, **asked)
+        kept.keep(key, args.out)
     scores = ", ".join(f"{name} {value:.4g}" for name, value in meta["validation"].items())
     print(f"{args.out}: {meta['crops']} crops of {meta['photographs']} photographs; validation: {scores}")
     return DONE

@@ -8,7 +8,6 @@ of the one halfway down the list.
 
 from __future__ import annotations
 
-import hashlib
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from bench import cache, provenance
 from bench.datasets import colmap
 from bench.datasets.colmap import Placed
 from bench.datasets.photographs import Source, folder
@@ -30,7 +30,6 @@ class Captured(Dataset):
     """Photographs of one place by one camera; poses come from structure from motion, done once and kept."""
 
     path: Path
-    cache: Path = Path("runs/cache/models")  # finished models, by the hash of what they were made from
     held_out: int = 5  # every so-manieth photograph is a query
     first: str | None = None  # the two photographs whose cameras fix the unit of length
     second: str | None = None
@@ -44,7 +43,7 @@ class Captured(Dataset):
 
     def scene(self) -> Scene:
         sources = folder(self.path)
-        found = colmap.read_model(_model(self.path, sources, self.cache))
+        found = colmap.read_model(_model(self.path, sources))
         first, second = self.first or sources[0].name, self.second or sources[len(sources) // 2].name
         scale = self.length / _distance(found, first, second)
         held_out = {source.name for source in sources[:: self.held_out]}
@@ -61,20 +60,17 @@ class Captured(Dataset):
         )
 
 
-def _model(directory: Path, sources: list[Source], cache: Path) -> Path:
-    """The folder of the model of these very photographs, made unless it is there."""
-    digest = hashlib.sha256(f"pycolmap {pycolmap.__version__}\n".encode())
-    for source in sources:
-        digest.update(f"{source.name} {source.content_hash()}\n".encode())
-    kept = cache / digest.hexdigest()[:32]
-    if not colmap.is_model(kept):
+def _model(directory: Path, sources: list[Source]) -> Path:
+    """The folder of the model of these very photographs, made unless it is kept."""
+
+    def make(kept: Path) -> None:
         with tempfile.TemporaryDirectory() as scratch, quietly():
-            built = _structure_from_motion(directory, [source.name for source in sources], Path(scratch))
-            unfinished = kept.with_suffix(".unfinished")
-            unfinished.mkdir(parents=True, exist_ok=True)
-            built.write(unfinished)
-            unfinished.replace(kept)
-    return kept
+            _structure_from_motion(directory, [source.name for source in sources], Path(scratch)).write(kept)
+
+    photographs = {source.name: source.content_hash() for source in sources}
+    return cache.folder(
+        "models", {"pycolmap": pycolmap.__version__, "photographs": photographs, "source": provenance.source(__name__)}, make
+    )
 
 
 def _structure_from_motion(directory: Path, names: list[str], scratch: Path) -> pycolmap.Reconstruction:

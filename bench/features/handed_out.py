@@ -17,7 +17,8 @@ import numpy as np
 from bench.errors import UnitError, UserError
 from bench.features.stored import out_of_square, upright
 from bench.plugin import Attack, ImageAttack, Trial
-from bench.tasks.reconstruction import recovered
+from bench.recovery import recovered
+from bench.tasks.reconstruction import view
 from bench.types import Bytes, Descriptors, Floats, WordSets
 
 SIFT = 128  # components
@@ -48,7 +49,7 @@ def described(trial: Trial, path: Path, attack: Attack | None) -> Described:
     if isinstance(attack, ImageAttack):
         raise UnitError(f"{attack.name()} recovers no descriptors")
     if attack is not None:
-        found, _ = recovered(attack, trial)
+        found = recovered(attack, trial, view(trial)).selection
         keypoints, rows = release.keypoints[found.rows], found.descriptors
     elif isinstance(release, Descriptors):
         keypoints, rows = release.keypoints, release.descriptors

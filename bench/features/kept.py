@@ -1,19 +1,32 @@
-"""The features of images that are dear to read, kept by the hash of the image, the extractor and its source."""
+"""Features of images that are dear to read, and the words that descriptors quantise to, kept by the hash of what made them.
+
+Both are the owner's secrets, as the photographs are. Only the runner keeps them, which measures; nothing that protects does.
+"""
 
 from __future__ import annotations
 
-import sys
+import hashlib
+import itertools
+import multiprocessing
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from typing import Any
 
 import numpy as np
+import torch
 
-from bench import cache, environment, spec
+from bench import cache, environment, provenance, spec, threads
 from bench.datasets.scene import Pixels
+from bench.features import dictionary
+from bench.features.dictionary import Dictionary
 from bench.plugin import Extractor
+from bench.progress import Progress
 from bench.tensorfile import Arrays
-from bench.types import Features
+from bench.types import Bytes, Features, Floats, Indices
 
 KIND = "features"
+WORDS = "words"
+FEW = 16  # images that are not worth processes of their own
 
 
 def features(extractor: Extractor, pixels: Pixels) -> Features:
@@ -33,23 +46,52 @@ def features(extractor: Extractor, pixels: Pixels) -> Features:
     return from_arrays(arrays, tuple(meta["size"]))
 
 
-def keep(extractor: Extractor, pixels: Pixels) -> None:
+def all_features(extractor: Extractor, images: Sequence[Pixels]) -> Iterator[Features]:
+    """The features of images; where many are not kept yet, as many processes extract them as this one may use threads.
+
+    Raises
+    ------
+    UnitError
+        if one of them cannot be read.
+    """
+    missing = [image for image in images if not cache.path(KIND, _key(extractor, image)).is_file()]
+    processes = torch.get_num_threads()
+    if len(missing) > FEW and processes > 1:
+        executor = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), threads.limit, (1,))
+        with executor, Progress("features of reference images", len(missing)) as progress:
+            for _ in executor.map(_keep, itertools.repeat(extractor), missing):
+                progress.advance()
+    return (features(extractor, image) for image in images)
+
+
+def _keep(extractor: Extractor, pixels: Pixels) -> None:
     """As `features`, for a process that keeps them for others."""
     features(extractor, pixels)
-
-
-def is_kept(extractor: Extractor, pixels: Pixels) -> bool:
-    """Whether the features are on disk."""
-    return cache.path(KIND, _key(extractor, pixels)).is_file()
 
 
 def _key(extractor: Extractor, pixels: Pixels) -> dict[str, Any]:
     return {
         "image": pixels.content_hash(),
         "extractor": spec.written(extractor),
-        "source": cache.source(sys.modules[type(extractor).__module__]),
+        "source": provenance.source(type(extractor).__module__),
         "libraries": environment.libraries(),
     }
+
+
+def nearest_words(known: Dictionary, rows: Bytes | Floats) -> Indices:
+    """The nearest word of each of (N, D) rows, unless they were found before. -> (N,) int64"""
+
+    def make() -> cache.Made:
+        return {"words": known.index.nearest(rows)}, {}
+
+    content = hashlib.sha256(np.ascontiguousarray(rows).data).hexdigest()
+    key = {
+        "dictionary": known.digest,
+        "rows": [content, str(rows.dtype), list(rows.shape)],
+        "source": provenance.source(dictionary.__name__),
+        "environment": environment.computing(),
+    }
+    return cache.fetch(WORDS, key, make)[0]["words"]
 
 
 def to_arrays(found: Features) -> Arrays:

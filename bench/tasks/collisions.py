@@ -61,8 +61,10 @@ class Collisions(Task):
         if not isinstance(defense, Lifting):
             raise UnitError("collisions needs subspaces through words of a database")
         lifted = defense.lifted(trial.secret, trial.public, trial.rng)
-        words = unit_rows(trial.public.dictionary(fields.asset_fields(defense)["database"]).words)  # (K, D)
-        points = np.concatenate([trial.secret.descriptors[:, None], words[lifted.words]], axis=1)  # (N, 1 + a, D) d, a_i
+        words = trial.public.dictionary(fields.asset_fields(defense)["database"]).words  # (K, D)
+        points = np.concatenate(
+            [trial.secret.descriptors[:, None], unit_rows(words[lifted.words])], axis=1
+        )  # (N, 1 + a, D) d, a_i
         shared = company(lifted.release, _subspaces(trial.others(self.others)), defense.adversarial, self.coverage)
         nearest = nearest_that_meet(points.astype(np.float64), shared)  # (N, 1 + a)
         clear = no_collision(nearest, self.tolerance)

@@ -64,16 +64,17 @@ class Intersections(Task):
         defense = trial.defense
         if not isinstance(defense, Lifting):
             raise UnitError("intersections needs subspaces through words of a database")
-        codes = trial.public.dictionary(fields.asset_fields(defense)["database"]).words  # (K, D)
-        words = unit_rows(codes)
+        words = trial.public.dictionary(fields.asset_fields(defense)["database"]).words  # (K, D)
         count = self.subspaces or len(trial.secret)
         alone, among = [], []
         for secret in rounds(trial.secret, count, trial.rng):
             lifted = defense.lifted(secret, trial.public, trial.rng)
-            near, _ = nearest_to_subspaces(lifted.release, codes, max(COUNTS) + defense.adversarial)  # (n, N + a)
+            near, _ = nearest_to_subspaces(lifted.release, words, max(COUNTS) + defense.adversarial)  # (n, N + a)
             for rows in np.array_split(np.arange(len(near)), -(-len(near) // BATCH)):
-                points = np.concatenate([secret.descriptors[rows, None], words[lifted.words[rows]]], axis=1)  # (b, 1 + a, D)
-                match = matches(words[near[rows]], points, self.ratio)  # (b, N + a)
+                points = np.concatenate(
+                    [secret.descriptors[rows, None], unit_rows(words[lifted.words[rows]])], axis=1
+                )  # (b, 1 + a, D)
+                match = matches(unit_rows(words[near[rows]]), points, self.ratio)  # (b, N + a)
                 among.append(match)
                 alone.append(without(match, (near[rows][:, :, None] == lifted.words[rows][:, None]).any(axis=2), max(COUNTS)))
         return Outcome(metrics={**_shares("success", alone), **_shares("with_adversarial", among), "subspaces": float(count)})

@@ -10,21 +10,19 @@ from typing import Any
 
 import numpy as np
 
-from bench import fields, registry, spec, units
+from bench import fields, recovery, registry, spec, units
 from bench.datasets.scene import Mask
 from bench.errors import UnitError, UserError, blamed
 from bench.plugin import (
     Attack,
     Dataset,
     Defense,
-    DescriptorAttack,
     Extractor,
     ImageAttack,
     LocalMetric,
     Metric,
     Outcome,
     Selection,
-    SelectiveAttack,
     Task,
     Trial,
     View,
@@ -83,14 +81,16 @@ class Reconstruction(Task):
             raise UnitError("reconstruction needs an attack")
         if isinstance(attack, ImageAttack):
             return compared(trial, None, reconstructed(attack, view(trial), trial))
-        found, told = recovered(attack, trial)
+        found = recovery.recovered(attack, trial, view(trial))
         inverter, undefended, reason = self._inverter(trial.extractor, trial.public)
         if reason is not None:
-            return compared(trial, found, None, (*told, f"no image: {reason}"))
-        keypoints = trial.release.keypoints[found.rows]
-        release = Descriptors(keypoints=keypoints, size=trial.release.size, descriptors=found.descriptors)
+            outcome = compared(trial, found.selection, None, (*found.notes, f"no image: {reason}"))
+            return dataclasses.replace(outcome, spared=found.spared)
+        keypoints = trial.release.keypoints[found.selection.rows]
+        release = Descriptors(keypoints=keypoints, size=trial.release.size, descriptors=found.selection.descriptors)
         seen = view(dataclasses.replace(trial.released(release), attack=inverter, defense=undefended))
-        return compared(trial, found, reconstructed(inverter, seen, trial), told)
+        outcome = compared(trial, found.selection, reconstructed(inverter, seen, trial), found.notes)
+        return dataclasses.replace(outcome, spared=found.spared)
 
     def _inverter(self, extractor: Extractor, public: Public) -> tuple[ImageAttack, Defense, str | None]:
         """The attack that paints descriptors, the defense that it was made for, and why it cannot be used, if it cannot."""
@@ -144,26 +144,10 @@ def reconstructed(attack: ImageAttack, seen: View, trial: Trial) -> Floats:
     with blamed(f"plugin {attack.name()}"):
         image: Floats = trial.carry_out(attack.reconstruct, seen, trial.rng)
         width, height = seen.release.size
-        _expect(image, (height, width, 3))
+        recovery.expect(image, (height, width, 3))
         if image.min() < 0 or image.max() > 1:
             raise ValueError(f"returned values from {image.min()} to {image.max()}, expected 0 to 1")
     return image
-
-
-def recovered(attack: Attack, trial: Trial) -> tuple[Selection, tuple[str, ...]]:
-    """The attacker's descriptors, and what he says of them."""
-    seen, everything = view(trial), trial.secret.descriptors
-    with blamed(f"plugin {attack.name()}"):
-        if isinstance(attack, SelectiveAttack):
-            found = trial.carry_out(attack.select, seen, trial.rng)
-            _expect(found.descriptors, everything[found.rows].shape)
-        elif isinstance(attack, DescriptorAttack):
-            descriptors = trial.carry_out(attack.recover, seen, trial.rng)
-            _expect(descriptors, everything.shape)
-            found = Selection(rows=np.arange(len(everything)), descriptors=descriptors)
-        else:
-            raise TypeError(f"{attack.name()} recovers neither descriptors nor images")
-    return found, tuple(map(str, seen.notes))
 
 
 def compared(trial: Trial, found: Selection | None, image: Floats | None, notes: tuple[str, ...] = ()) -> Outcome:
@@ -174,7 +158,11 @@ def compared(trial: Trial, found: Selection | None, image: Floats | None, notes:
         if metric.compares == "images":
             values[metric.name()] = None if image is None else _measured(metric, truth, image)
         else:
-            described = None if found is None else _measured(metric, trial.secret.descriptors[found.rows], found.descriptors)
+            described = (
+                None
+                if found is None or len(found.rows) == 0
+                else _measured(metric, trial.secret.descriptors[found.rows], found.descriptors)
+            )
             values[metric.name()] = described
     if image is not None and (mask := trial.shots[0].foreground()) is not None:
         values |= parts(trial.metrics, truth, image, mask)
@@ -199,15 +187,6 @@ def _measured(metric: Metric, truth: Floats, estimate: Floats) -> float | None:
         if value is not None and not np.isfinite(value):
             raise ValueError(f"returned {value}; a metric returns None where its value is not finite")
         return None if value is None else float(value)
-
-
-def _expect(array: Any, shape: tuple[int, ...]) -> None:
-    if not isinstance(array, np.ndarray):
-        raise TypeError(f"returned {type(array).__name__}, expected a NumPy array")
-    if array.dtype != np.float32 or array.shape != shape:
-        raise ValueError(f"returned {array.dtype} {array.shape}, expected float32 {shape}")
-    if not np.isfinite(array).all():
-        raise ValueError("returned values that are not finite")
 
 
 PLUGIN = Reconstruction

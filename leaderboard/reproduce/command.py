@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from rich.text import Text
 
-from bench import pool
+from bench import engines, threads
+from bench.engines import Engine
 from bench.errors import UserError, unknown
 from bench.plugin import Asset, Dataset, Extractor
 from leaderboard.reproduce import figures, report, run, tables
@@ -72,11 +72,10 @@ def reproduce(
         seed=seed,
     )
     folder = out or Path("runs") / f"reproduce-{sizes.name}-{_named(images, judged)}"
-    processes = workers or (os.cpu_count() or 1 if of_place else 1)
-    pool.share(processes)
+    engine = engines.choose(workers or (threads.cores() if of_place else 1))
     if name in drawings:
-        return _figures(name, drawings[name], setting, judged, folder, processes)
-    rebuilt = run.rebuild(known[name], setting, judged, folder, processes)
+        return _figures(name, drawings[name], setting, judged, folder, engine)
+    rebuilt = run.rebuild(known[name], setting, judged, folder, engine)
     report.write(rebuilt, folder)
     return Done(out=folder, shown=tuple(report.to_rich(rebuilt)), failed=run.failures(rebuilt.ran))
 
@@ -100,10 +99,10 @@ def _named(images: Path | None, judged: Judged) -> str:
     return "builtin" if images is None else images.resolve().name
 
 
-def _figures(name: str, drawings: tuple[Drawing, ...], setting: Setting, judged: Judged, out: Path, workers: int) -> Done:
+def _figures(name: str, drawings: tuple[Drawing, ...], setting: Setting, judged: Judged, out: Path, engine: Engine) -> Done:
     """Run the rows of these figures, and draw them into `out`/figures."""
     rows = {row.name: row for drawing in drawings for row in drawing.rows(setting)}
-    ran = run.execute(list(rows.values()), setting, judged, out, name, workers)
+    ran = run.execute(list(rows.values()), setting, judged, out, name, engine)
     scene = Scene(setting=setting, judged=judged, ran=ran, out=out)
     shown = []
     for drawing in drawings:

@@ -13,7 +13,7 @@ from PIL import Image
 
 from bench import units
 from bench.errors import UnitError
-from bench.runner import picture
+from bench.rundir import picture
 from bench.types import Bytes
 from leaderboard.figures import Panel
 from leaderboard.reproduce.profiles import Setting

@@ -11,6 +11,7 @@ import pandas as pd
 from bench import runner, units
 from bench.datasets import photographs
 from bench.datasets.photographs import Source
+from bench.engines import HERE, Engine
 from bench.plugin import Dataset, Task
 from bench.progress import Progress
 from bench.records import Record
@@ -94,7 +95,7 @@ def queries(dataset: Dataset) -> Judged:
     return Judged(name=f"queries of {scene.name}", names=names, available=len(names), dataset=dataset)
 
 
-def rebuild(table: Table, setting: Setting, judged: Judged, out: Path, workers: int = 1) -> Rebuilt:
+def rebuild(table: Table, setting: Setting, judged: Judged, out: Path, engine: Engine = HERE) -> Rebuilt:
     """Run what `out` does not hold yet, and weigh the claims.
 
     Raises
@@ -103,22 +104,24 @@ def rebuild(table: Table, setting: Setting, judged: Judged, out: Path, workers: 
         if a file is missing or does not fit; nothing has been written then.
     """
     rows = (*table.rows(setting), *table.borrowed(setting))
-    return weigh(table, setting, judged, execute(rows, setting, judged, out, table.name, workers))
+    return weigh(table, setting, judged, execute(rows, setting, judged, out, table.name, engine))
 
 
-def execute(rows: Sequence[Row], setting: Setting, judged: Judged, out: Path, title: str, workers: int = 1) -> Ran:
+def execute(rows: Sequence[Row], setting: Setting, judged: Judged, out: Path, title: str, engine: Engine = HERE) -> Ran:
     """Run the rows, one plan for each task; records that `out` holds are not made again."""
     plans = [_plan(task, rows, setting, judged) for task in dict.fromkeys(row.task for row in rows)]
     cells = {row.name: _cell(row, plans) for row in rows}
-    records: dict[str, list[Record]] = {}
+    found: list[Record] = []
     with Progress(f"{title}: {len(judged.names)} {judged.name}, {len(rows)} rows", sum(map(len, plans))) as progress:
-        while plans:  # a plan that is done lets go of the releases that it made
-            for record in runner.execute(plans.pop(0), out, workers):
-                records.setdefault(record["cell_id"], []).append(record)
-                progress.advance(note=record["unit"])
-                if record["status"] == "failed":
-                    progress.say(f"bench: failed: {record['unit']}, {record['defense']['name']}: {record['reason']}")
-    return Ran(rows=tuple(rows), cells=cells, records={cell: tuple(found) for cell, found in records.items()})
+        for record in runner.execute(plans, out, engine):
+            found.append(record)
+            progress.advance(note=record["unit"])
+            if record["status"] == "failed":
+                progress.say(f"bench: failed: {record['unit']}, {record['defense']['name']}: {record['reason']}")
+    records: dict[str, list[Record]] = {}
+    for record in runner.in_order(plans, found):
+        records.setdefault(record["cell_id"], []).append(record)
+    return Ran(rows=tuple(rows), cells=cells, records={cell: tuple(its) for cell, its in records.items()})
 
 
 def weigh(table: Table, setting: Setting, judged: Judged, ran: Ran) -> Rebuilt:
@@ -181,7 +184,7 @@ def _columns(table: Table, ran: Ran) -> dict[Cell, pd.Series]:
                 for record in of(ran, row.name)
                 if record["status"] == "ok"
                 and record["metrics"].get(wanted.metric) is not None
-                and wanted.condition in (None, record["condition"])
+                and wanted.condition in (None, record.get("condition"))
             },
             dtype=float,
         )

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from bench import runner, units
+from bench import rundir, units
 from bench.datasets import photographs
 from bench.datasets.photographs import Source
 from bench.errors import UnitError
@@ -33,7 +33,7 @@ class Pair:
 def pairs(found: Iterable[Found], out: Path) -> Iterator[tuple[Record, Pair]]:
     """The records of which there is a reconstruction, with their pictures, which are written into the site `out`."""
     for one in found:
-        made = _as_it_is(one.folder, runner.picture(one.folder, one.record), out)
+        made = _as_it_is(one.folder, rundir.picture(one.folder, one.record), out)
         if made is not None:
             original = _as_it_is(one.folder, report.photograph(one.folder, one.record), out) or _builtin(one.record, out)
             yield one.record, Pair(made=made, original=original)

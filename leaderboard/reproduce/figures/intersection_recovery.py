@@ -29,8 +29,8 @@ HALVINGS = 5
 
 def counts(setting: Setting, dim: int) -> list[int]:
     """How many releases of other photographs are seen, fewest first."""
-    most = setting.profile.reduced.get("others", MOST[dim])
-    return [seen for halvings in range(HALVINGS, -1, -1) if (seen := most >> halvings)]
+    reduced = setting.profile.reduced.get("others")
+    return [reduced] if reduced else [MOST[dim] >> halvings for halvings in range(HALVINGS, -1, -1)]
 
 
 def rows(setting: Setting) -> tuple[Row, ...]:

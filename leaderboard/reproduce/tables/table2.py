@@ -56,7 +56,7 @@ def about(measure: str) -> tuple[Claim, ...]:
             statements=interior(private),
         ),
         Claim(
-            text=f"LDP over all descriptors localizes nothing: under {ZERO:g}%.",
+            text=f"LDP over all descriptors localizes nothing: accuracy equals 0, to within {ZERO:g} points.",
             statements=(
                 Statement(text=f"[{private_name()}] {measure} < {ZERO:g}", weights={at(FULL, "10", 2): 1.0}, below=ZERO),
             ),
@@ -70,7 +70,7 @@ def about(measure: str) -> tuple[Claim, ...]:
             ),
         ),
         Claim(
-            text=f"Equal m/|K| gives equal accuracy, within {NEARLY:g} points.",
+            text=f"Where m/|K| is equal, accuracy equals, to within {NEARLY:g} points.",
             statements=tuple(about_equal(at("512000", epsilon, 4), at("256000", epsilon, 2), NEARLY) for epsilon in EPSILONS),
         ),
         Claim(

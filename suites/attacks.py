@@ -1,0 +1,16 @@
+"""Every attack against every defense that it applies to: who is the strongest."""
+
+from bench import fields, registry
+from bench.suite import Suite, grid
+from defenses.affine import Affine
+from defenses.ldp import LDP
+from defenses.naive_ldp import NaiveLDP
+from defenses.none import Undefended
+
+SUITE = Suite(
+    summary="every attack, those of installed packages too, against every defense that it applies to",
+    parts=grid(
+        defenses=[Undefended(), Affine(), LDP(), LDP(epsilon=16), NaiveLDP()],
+        attacks=[attack() for attack in registry.everything(registry.ATTACK) if not fields.without_default(attack)],
+    ),
+)

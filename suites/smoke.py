@@ -1,0 +1,19 @@
+"""Seconds: a defense of each kind of release, and the cheapest attackers."""
+
+from attacks.dia import DIA
+from attacks.keypoints import Keypoints
+from attacks.nearest import Nearest
+from bench.datasets import photographs
+from bench.suite import Suite, grid
+from defenses.affine import Affine
+from defenses.ldp import LDP
+from defenses.none import Undefended
+
+SUITE = Suite(
+    summary="one photograph, in seconds: whether everything is in its place",
+    parts=grid(
+        defenses=[Undefended(), Affine(), LDP()],
+        attacks=[Keypoints(), DIA(), Nearest()],
+        images=[source for source in photographs.builtin() if source.name == "rocket"],  # it has the fewest keypoints
+    ),
+)
