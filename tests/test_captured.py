@@ -68,6 +68,14 @@ def test_structure_from_motion_finds_the_gallery_s_cameras(dataset: Captured, tr
     assert found[0].pixels.read().shape == (300, 400, 3)
 
 
+def test_queries_can_be_a_stretch(dataset: Captured) -> None:
+    scene = replace(dataset, leading=4).scene()
+    assert [query.name for query in scene.queries] == ["0.png", "1.png", "2.png", "3.png"]
+    assert len(scene.references) == COUNT - 4
+    with pytest.raises(UserError, match="none a reference"):
+        replace(dataset, leading=COUNT).scene()
+
+
 def test_model_is_kept_by_content(dataset: Captured, photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = dataset.scene()
 
@@ -106,7 +114,7 @@ def test_photographs_of_nothing_in_common(tmp_path: Path) -> None:
     assert [entry for entry in cache.entries() if entry.kind == "models"] == before
 
 
-@pytest.mark.parametrize("fields", [{"held_out": 1}, {"length": 0.0}, {"length": float("nan")}])
+@pytest.mark.parametrize("fields", [{"held_out": 1}, {"leading": -1}, {"length": 0.0}, {"length": float("nan")}])
 def test_impossible_fields_are_refused(fields: dict) -> None:
     with pytest.raises(UserError, match="captured: "):
         Captured(path=Path("x"), **fields)

@@ -1,9 +1,9 @@
 """A folder of photographs of one place by one camera, as a scene: structure from motion gives the poses.
 
 The poses, of all photographs with raw descriptors, are the ground truth, as they were for Aachen. Every fifth photograph is a
-query; it has no part in the map or the dictionary, which are made from references alone. Structure from motion leaves the unit
-of length open; here it is fixed by the distance of two cameras: unless two are named, those of the first photograph by name and
-of the one halfway down the list.
+query unless told otherwise; it has no part in the map or the dictionary, which are made from references alone. Structure from
+motion leaves the unit of length open; here it is fixed by the distance of two cameras: unless two are named, those of the first
+photograph by name and of the one halfway down the list.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ class Captured(Dataset):
     """Photographs of one place by one camera; poses come from structure from motion, done once and kept."""
 
     path: Path
-    held_out: int = 5  # every so-manieth photograph is a query
+    held_out: int = 5  # every so-manieth photograph is a query,
+    leading: int = 0  # or, unless this is 0, so many from the first by name on: a stretch, for structure from motion
     first: str | None = None  # the two photographs whose cameras fix the unit of length
     second: str | None = None
     length: float = 1.0  # of the distance between them
@@ -38,15 +39,20 @@ class Captured(Dataset):
     def __post_init__(self) -> None:
         if self.held_out < 2:
             raise UserError("captured: held_out must be at least 2, or there are no references")
+        if self.leading < 0:
+            raise UserError("captured: leading must be at least 0")
         if not 0 < self.length < np.inf:
             raise UserError("captured: length must be finite and above zero")
 
     def scene(self) -> Scene:
         sources = folder(self.path)
+        chosen = sources[: self.leading] if self.leading else sources[:: self.held_out]
+        if len(chosen) == len(sources):
+            raise UserError(f"{self.path}: all {len(sources)} photographs would be queries, and none a reference")
         found = colmap.read_model(_model(self.path, sources))
         first, second = self.first or sources[0].name, self.second or sources[len(sources) // 2].name
         scale = self.length / _distance(found, first, second)
-        held_out = {source.name for source in sources[:: self.held_out]}
+        held_out = {source.name for source in chosen}
         images = {
             name: _image(self.path / name, camera, pycolmap.Rigid3d(pose.rotation, pose.translation * scale), name)
             for name, (_, camera, pose) in sorted(found.items())

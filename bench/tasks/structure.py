@@ -51,7 +51,7 @@ class Structure(Task):
     def collection(self, images: Images, dataset: Dataset | None) -> Collection:
         if images is not None:
             raise UserError(
-                "structure is about a place and takes no images; give --dataset, such as captured:path=DIR,held_out=2"
+                "structure is about a place and takes no images; give --dataset, such as captured:path=DIR,leading=25"
             )
         scene = (dataset or Walk()).scene()
         chosen = scene.queries[: self.images]
