@@ -92,8 +92,9 @@ def heading(study: Study) -> str:
         f"the same {study.trained_on} photographs, in batches of 8 crops. **That is a small budget**: read differences between "
         "networks that were trained equally long, not how well any of them paints; a difference may grow, or vanish, with "
         "longer training. In brackets: 95% bootstrap over photographs, the 100 of `test.txt` and the 7 built-in ones, which no "
-        "network was trained or chosen on. Differences are of the same photographs; *leaks more* is said where the interval on "
-        "`test.txt` lies above 0.\n"
+        "network was trained or chosen on. Differences are of the same photographs; a network *paints better* where the interval "
+        "on `test.txt` lies above 0. Each was trained once, and how much another seed would differ is in no interval. What is "
+        "told more leaks no less: a network that is told more and paints worse has not learned to use it.\n"
     )
 
 
@@ -164,7 +165,7 @@ def table(names: tuple[str, str], found: Mapping[tuple[str, str], Scores]) -> li
 
 def comparisons(found: Mapping[tuple[str, str], Scores], pairs: Sequence[tuple[tuple[str, str], tuple[str, str]]]) -> list[str]:
     """Paired differences in SSIM, and what they say."""
-    lines = [markdown_row(("SSIM of", "less that of", "test", "built-in", "leaks")), markdown_row(["---"] * 5)]
+    lines = [markdown_row(("SSIM of", "less that of", "test", "built-in", "paints")), markdown_row(["---"] * 5)]
     for one, other in pairs:
         apart = {where: interval(found[one][where]["ssim"] - found[other][where]["ssim"]) for where in ("test", "built-in")}
         names = (" ".join(f"`{part}`" for part in label) for label in (one, other))
@@ -173,8 +174,8 @@ def comparisons(found: Mapping[tuple[str, str], Scores], pairs: Sequence[tuple[t
 
 
 def verdict(apart: Interval) -> str:
-    """What a difference says of what leaks."""
-    return "more" if apart.low > 0 else "less" if apart.high < 0 else "cannot be told"
+    """How the first of two networks fares."""
+    return "better" if apart.low > 0 else "worse" if apart.high < 0 else "cannot be told"
 
 
 def written(value: Interval, digits: int, sign: str = "") -> str:
