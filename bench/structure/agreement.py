@@ -22,8 +22,9 @@ def right(model: Model, truth: Sequence[pycolmap.Rigid3d]) -> int:
     ----------
     truth : cam_from_world of every image, registered or not
     """
-    true = np.array([truth[image].inverse().translation for image in model.images])  # (V, 3)
-    near = NEAR * float(np.linalg.norm(true[:, None] - true[None], axis=2).max())
+    every = np.array([pose.inverse().translation for pose in truth])  # (I, 3)
+    near = NEAR * float(np.linalg.norm(every[:, None] - every[None], axis=2).max())
+    true = every[list(model.images)]  # (V, 3)
     options = pycolmap.RANSACOptions(max_error=near, min_inlier_ratio=0.1, max_num_trials=1000, random_seed=0)
     found: Any = pycolmap.estimate_sim3d_robust(model.centres, true, options)  # a dict, whatever its signature says
     if found is None:
