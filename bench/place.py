@@ -16,7 +16,7 @@ from bench.localization import covisible, mapping, maps
 from bench.localization.maps import Map
 from bench.localization.retrieval import Bags
 from bench.plugin import Extractor
-from bench.types import Features, Indices
+from bench.types import Bytes, Features, Indices
 
 WORDS = 32_000  # of the dictionary, unless it is said how many
 SEED = 0  # of the clustering
@@ -84,6 +84,8 @@ class Place:
     def dictionary(self, words: int) -> Dictionary:
         """So many words clustered from the references' descriptors; `WORDS` for 0.
 
+        Where the extractor has a limit on keypoints, and with it there are too few descriptors, all that there are serve.
+
         Raises
         ------
         UserError
@@ -94,13 +96,20 @@ class Place:
         return Dictionary(arrays["words"], meta, f"{self.digest}, {size} words")
 
     def _clustered(self, size: int) -> cache.Made:
-        found = [features.codes for features in self.references if features.codes is not None]
-        if len(found) < len(self.references):
-            raise UserError(f"{self.extractor.name()} gives no 8-bit descriptors, which a dictionary's words are made of")
-        codes = np.concatenate(found)
+        codes = self._codes(self.extractor)
+        if len(codes) < size:
+            codes = self._codes(self.extractor.unlimited())
         if len(codes) < size:
             raise UserError(f"{self.scene.name}: its references have {len(codes)} descriptors, too few for {size} words")
         words = build.cluster(codes, size, np.random.default_rng(SEED))
         photographs = sorted({image.pixels.content_hash() for image in self.scene.references})
         meta = {"extractor": spec.written(self.extractor), "photographs": photographs, "descriptors": len(codes), "seed": SEED}
         return {"words": words}, meta
+
+    def _codes(self, extractor: Extractor) -> Bytes:
+        """The descriptors of all references. -> (n, D)"""
+        found = [features.codes for features in kept.all_features(extractor, [image.pixels for image in self.scene.references])]
+        codes = [each for each in found if each is not None]
+        if len(codes) < len(found):
+            raise UserError(f"{extractor.name()} gives no 8-bit descriptors, which a dictionary's words are made of")
+        return np.concatenate(codes)

@@ -305,6 +305,10 @@ class Extractor(Plugin, ABC):
             if there is no keypoint.
         """
 
+    def unlimited(self) -> Extractor:
+        """The same without its limit on the number of keypoints, if it has one: for dictionaries, which are made of many."""
+        return self
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Shot:

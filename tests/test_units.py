@@ -84,6 +84,13 @@ def test_words_of_the_references_are_clustered_to_the_number_asked_for(tmp_path:
         Public().dictionary("references")
 
 
+def test_more_words_than_the_limit_on_keypoints_gives_are_made_of_all_keypoints(tmp_path: Path) -> None:
+    place = Place(scene(tmp_path / "scene"), Sift(max_keypoints=5))
+    assert sum(map(len, place.references)) == 15
+    assert len(place.dictionary(15)) == 15
+    assert len(place.dictionary(40)) == 40
+
+
 def test_a_place_keeps_no_query_for_attackers_to_find(tmp_path: Path) -> None:
     whole = scene(tmp_path / "scene")
     assert whole.queries

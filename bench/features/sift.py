@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+import sys
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -58,6 +59,9 @@ class Sift(Extractor):
             keypoints=xy[keep], descriptors=unit_rows(codes[keep]), codes=codes[keep], size=(width, height), frames=frames[keep]
         )
         return found.by_position()
+
+    def unlimited(self) -> Extractor:
+        return replace(self, max_keypoints=sys.maxsize)
 
 
 def _once_each(points: list) -> list:

@@ -1,14 +1,17 @@
-"""Whether cameras that structure from motion placed stand where they truly are, up to a similarity."""
+"""Whether cameras that structure from motion placed stand where they truly are, up to a similarity.
+
+Positions alone leave open how a model is turned about the line of a straight walk, so rotations count as well: every two images
+a and b propose the similarity that puts a's pose right and b at its true distance from it. The one that most images agree with
+is taken.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import pycolmap
 
-from bench.structure.consistency import Doubles
 from bench.structure.mapping import Model
 
 NEAR = 0.05  # of the largest distance between two of the true cameras
@@ -16,27 +19,25 @@ TURN = 5.0  # degrees
 
 
 def right(model: Model, truth: Sequence[pycolmap.Rigid3d]) -> int:
-    """How many of the registered images have the right pose, in the similarity by which most positions fit.
+    """How many of the registered images have the right pose: within `NEAR` and `TURN`.
 
     Parameters
     ----------
     truth : cam_from_world of every image, registered or not
     """
-    true = np.array([truth[image].inverse().translation for image in model.images])  # (V, 3)
-    near = NEAR * float(np.linalg.norm(true[:, None] - true[None], axis=2).max())
-    options = pycolmap.RANSACOptions(max_error=near, min_inlier_ratio=0.1, max_num_trials=1000, random_seed=0)
-    found: Any = pycolmap.estimate_sim3d_robust(model.centres, true, options)  # a dict, whatever its signature says
-    if found is None:
-        return 0
-    moved: pycolmap.Sim3d = found["tgt_from_src"]
-    off = np.linalg.norm(_transformed(moved, model.centres) - true, axis=1)
-    turned = [
-        np.degrees((pose.rotation * moved.rotation.inverse()).angle_to(truth[image].rotation))
-        for image, pose in zip(model.images, model.poses, strict=True)
-    ]
-    return int(((off <= near) & (np.array(turned) <= TURN)).sum())
-
-
-def _transformed(moved: pycolmap.Sim3d, points: Doubles) -> Doubles:
-    """(N, 3) -> (N, 3)"""
-    return np.asarray(moved.scale * points @ moved.rotation.matrix().T + moved.translation)
+    every = np.array([pose.inverse().translation for pose in truth])  # (I, 3)
+    near = NEAR * float(np.linalg.norm(every[:, None] - every[None], axis=2).max())
+    true, centres = every[list(model.images)], model.centres  # (V, 3) twice
+    turns = np.array(  # (V, 3, 3) from the model's world to the true one, as each image has it
+        [truth[image].rotation.matrix().T @ pose.rotation.matrix() for image, pose in zip(model.images, model.poses, strict=True)]
+    )
+    traces = np.einsum("aij,bij->ab", turns, turns)  # of the rotation between two of them: 1 + 2 cos
+    facing = traces >= 1 + 2 * np.cos(np.radians(TURN))  # (V, V)
+    most = 0
+    for a, turn in enumerate(turns):
+        moved = (centres - centres[a]) @ turn.T  # (V, 3)
+        lengths = np.linalg.norm(moved, axis=1)
+        scales = np.linalg.norm(true - true[a], axis=1)[lengths > 0] / lengths[lengths > 0]  # one for each b
+        off = np.linalg.norm(scales[:, None, None] * moved + true[a] - true, axis=2)  # (b, V)
+        most = max(most, int(((off <= near) & facing[a]).sum(axis=1).max(initial=0)))
+    return most

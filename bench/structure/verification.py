@@ -1,8 +1,8 @@
 """Which pairs of images see the same thing, and by which matches: an essential matrix by RANSAC, among the consistent matches.
 
 Where nearly all matches are accidents, some agree with whatever RANSAC finds. How many is measured, not assumed: the same is
-done for some of the pairs with their matches shuffled, and a geometry counts if clearly more agree with it than chance gives.
-Then every match is looked at again: it is kept if it agrees with the geometry and moves like one that was found with it.
+done for some of the pairs with their matches shuffled, and a geometry counts if a larger share agrees with it than with any of
+those. Then every match is looked at again: it is kept if it agrees with the geometry and moves like one that was found with it.
 """
 
 from __future__ import annotations
@@ -24,8 +24,7 @@ CONFIDENCE = 0.9999
 FEWEST = 100  # matches that are left, if there are as many
 LEAST = 15  # matches that a geometry rests on, COLMAP's own bound
 SAMPLE = 5  # matches that RANSAC fits: they agree in any case
-SHUFFLED = 16  # pairs whose matches are shuffled
-MARGIN = 1.25  # times what chance gives
+SHUFFLED = 32  # pairs whose matches are shuffled, about
 
 Pair = tuple[int, int]
 Matches = Mapping[Pair, Indices]  # images a < b -> (M, 2) keypoints of a, of b
@@ -50,6 +49,7 @@ def verified(
     ----------
     camera : of all images
     keypoints : (N, 2) of each image
+    threads : at once; the result does not depend on it
     """
     enough = [pair for pair, found in matches.items() if len(found) >= LEAST]
     sample = enough[:: max(1, len(enough) // SHUFFLED)]
@@ -70,9 +70,7 @@ def verified(
             progress.advance()
     chance = max((each.rate for each in found[: len(sample)] if each is not None), default=0.0)
     return {
-        pair: each
-        for pair, each in zip(enough, found[len(sample) :], strict=True)
-        if each is not None and each.rate > MARGIN * chance
+        pair: each for pair, each in zip(enough, found[len(sample) :], strict=True) if each is not None and each.rate > chance
     }
 
 
