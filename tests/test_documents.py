@@ -5,7 +5,6 @@ Some are run in a smaller form, or not at all; SMALLER and ELSEWHERE say which, 
 
 import re
 import shlex
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -15,7 +14,7 @@ from bench import cli, skeleton
 from bench.cli import parser
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = {"README": ROOT / "README.md", **{name: ROOT / "docs" / f"{name}.md" for name in ("method", "formats", "extending", "scale")}}
+PAGES = {name: ROOT / f"{name}.md" for name in ("README", "docs/method", "docs/formats", "docs/extending", "docs/scale")}
 FEW_VIEWS = "gallery:views=9,queries=2,rooms=1"
 
 # Run with more options, or fewer images, so that it takes seconds.
@@ -99,7 +98,7 @@ def test_what_is_said_of_commands_is_of_commands_that_are_there() -> None:
 
 
 def test_all_kinds_of_plugins_are_shown() -> None:
-    assert {command.split()[1] for command in commands("extending") if command.startswith("new ")} == set(skeleton.KINDS)
+    assert {command.split()[1] for command in commands("docs/extending") if command.startswith("new ")} == set(skeleton.KINDS)
 
 
 def test_targets_of_make_are_there() -> None:

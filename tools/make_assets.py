@@ -3,7 +3,8 @@
 The photographs of `train/` that are in neither list are parted by name into three thirds. The dictionary is made from the first
 two thirds, the attacker's public database from the last. Two more dictionaries, each made from another two thirds, quantise the
 photographs that the shipped dictionary was made from while networks are trained; they are not shipped. All networks start from
-one that was trained on raw descriptors, at one rate and then at half of it, and are then trained equally long for their own releases.
+one that was trained on raw descriptors, at one rate and then at half of it, and are then trained equally long for their own
+releases.
 """
 
 from __future__ import annotations
