@@ -72,8 +72,9 @@ _OF_TASKS = (
     Measure("rotation_error", "rotation error", -1, "median", "median over queries, in degrees; ∞ if not localized"),
     Measure("precision", "precision", 1, "mean", "share of matches that are right"),
     Measure("recall", "recall", 1, "mean", "share of right matches that are found"),
-    Measure("registered_images", "registered images", 1, "mean", "images of the scene that structure from motion could place"),
-    Measure("sparse_points", "sparse points", 1, "mean", "points of the map"),
+    Measure("registered", "registered images", 1, "mean", "images of the scene that structure from motion could place"),
+    Measure("right_poses", "right poses", 1, "mean", "registered images within 5% of the place's extent and 5° of the truth"),
+    Measure("points", "sparse points", 1, "mean", "points of the map"),
     Measure("track_length", "track length", 1, "mean", "images that see a point of the map"),
     Measure("reprojection_error", "reprojection error", -1, "mean", "in pixels"),
 )

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 
 from bench import spec
+from leaderboard.reproduce import run
 from leaderboard.reproduce.claims import Evidence, Finding, Verdict
 from leaderboard.reproduce.intervals import LEVEL, Interval
 from leaderboard.reproduce.run import Rebuilt
@@ -25,8 +26,8 @@ DIGITS = 4  # of the numbers that speak for a verdict
 SHORT = 12  # statements of a claim that are all written out; of more, those that do not hold or cannot be told
 MOST = 12  # of these that a terminal shows
 INTERVALS = (
-    f"In brackets: {LEVEL:.0%}, by percentile bootstrap over photographs or queries, of shares Wilson's; a verdict rests on the "
-    "bootstrap of the paired combination."
+    f"In brackets: {LEVEL:.0%}, by percentile bootstrap over photographs, queries or seeds, of shares Wilson's; a verdict rests "
+    "on the bootstrap of the paired combination."
 )
 
 
@@ -55,10 +56,9 @@ def heading(rebuilt: Rebuilt) -> str:
     judged, setting = rebuilt.judged, rebuilt.setting
     count, features = len(judged.names), extractor_label(spec.written(setting.extractor))
     of_all = "" if count == judged.available else f" of {judged.available}"
-    return (
-        f"{rebuilt.table.title}; profile {setting.profile.name}, {count}{of_all} {judged.name}, {features} features, "
-        f"seed {setting.seed}"
-    )
+    first, *others = run.seeds(rebuilt.table, setting)
+    seeds = f"seeds {first} to {others[-1]}" if others else f"seed {first}"
+    return f"{rebuilt.table.title}; profile {setting.profile.name}, {count}{of_all} {judged.name}, {features} features, {seeds}"
 
 
 def markdown(rebuilt: Rebuilt) -> str:
@@ -126,7 +126,7 @@ def numbers(rebuilt: Rebuilt) -> pd.DataFrame:
                 "measure": measure,
                 "paper": row.paper.get(measure),
                 **_fields(rebuilt.ours.get((row.name, measure))),
-                "cell_id": rebuilt.ran.cells[row.name],
+                "cell_id": " ".join(rebuilt.ran.cells[row.name]),
                 "note": rebuilt.notes[row.name],
             }
             for row in rebuilt.ran.rows
@@ -157,7 +157,7 @@ def plain(rebuilt: Rebuilt) -> dict[str, Any]:
         "units": {"of": rebuilt.judged.name, "names": list(rebuilt.judged.names), "available": rebuilt.judged.available},
         "dataset": None if rebuilt.judged.dataset is None else spec.written(rebuilt.judged.dataset),
         "extractor": spec.written(setting.extractor),
-        "seed": setting.seed,
+        "seeds": list(run.seeds(rebuilt.table, setting)),
         "rows": [_row(row, rebuilt) for row in rebuilt.ran.rows],
         "spearman": None if rebuilt.correlation is None or math.isnan(rebuilt.correlation) else rebuilt.correlation,
         "claims": [
@@ -234,7 +234,7 @@ def _row(row: Row, rebuilt: Rebuilt) -> dict[str, Any]:
         "defense": spec.written(row.defense),
         "attack": None if row.attack is None else spec.written(row.attack),
         "task": spec.written(row.task),
-        "cell_id": rebuilt.ran.cells[row.name],
+        "cell_ids": list(rebuilt.ran.cells[row.name]),
         "note": rebuilt.notes[row.name],
     }
 

@@ -45,7 +45,7 @@ class Ran:
     """Rows, and what the runner recorded of them."""
 
     rows: tuple[Row, ...]
-    cells: Mapping[str, str]  # row's name -> the cell_id of its records
+    cells: Mapping[str, tuple[str, ...]]  # row's name -> the cell_id of its records, for each seed
     records: Mapping[str, tuple[Record, ...]]  # cell_id -> its records
 
 
@@ -104,13 +104,30 @@ def rebuild(table: Table, setting: Setting, judged: Judged, out: Path, engine: E
         if a file is missing or does not fit; nothing has been written then.
     """
     rows = (*table.rows(setting), *table.borrowed(setting))
-    return weigh(table, setting, judged, execute(rows, setting, judged, out, table.name, engine))
+    return weigh(table, setting, judged, execute(rows, setting, judged, out, table.name, engine, seeds(table, setting)))
 
 
-def execute(rows: Sequence[Row], setting: Setting, judged: Judged, out: Path, title: str, engine: Engine = HERE) -> Ran:
-    """Run the rows, one plan for each task; records that `out` holds are not made again."""
-    plans = [_plan(task, rows, setting, judged) for task in dict.fromkeys(row.task for row in rows)]
-    cells = {row.name: _cell(row, plans) for row in rows}
+def seeds(table: Table, setting: Setting) -> range:
+    """That a table is done with."""
+    return range(setting.seed, setting.seed + (setting.profile.seeds if table.repeated else 1))
+
+
+def execute(
+    rows: Sequence[Row],
+    setting: Setting,
+    judged: Judged,
+    out: Path,
+    title: str,
+    engine: Engine = HERE,
+    seeds: Iterable[int] | None = None,
+) -> Ran:
+    """Run the rows, one plan for each task and seed, that of the setting alone for None.
+
+    Records that `out` holds are not made again.
+    """
+    tasks, each = dict.fromkeys(row.task for row in rows), (setting.seed,) if seeds is None else seeds
+    plans = [_plan(task, rows, setting, judged, seed) for seed in each for task in tasks]
+    cells = {row.name: _cells(row, plans) for row in rows}
     found: list[Record] = []
     with Progress(f"{title}: {len(judged.names)} {judged.name}, {len(rows)} rows", sum(map(len, plans))) as progress:
         for record in runner.execute(plans, out, engine):
@@ -143,8 +160,8 @@ def weigh(table: Table, setting: Setting, judged: Judged, ran: Ran) -> Rebuilt:
 
 
 def of(ran: Ran, row: str) -> tuple[Record, ...]:
-    """The records of a row."""
-    return ran.records.get(ran.cells[row], ())
+    """The records of a row, those of the first seed first."""
+    return tuple(record for cell in ran.cells[row] for record in ran.records.get(cell, ()))
 
 
 def failures(ran: Ran) -> int:
@@ -156,31 +173,30 @@ def _interval(measure: Measure, column: pd.Series) -> Interval:
     return proportion(column / measure.times, measure.times) if measure.share else interval(column)
 
 
-def _plan(task: Task, rows: Sequence[Row], setting: Setting, judged: Judged) -> Plan:
+def _plan(task: Task, rows: Sequence[Row], setting: Setting, judged: Judged, seed: int) -> Plan:
     pairs = [(row.defense, row.attack) for row in rows if row.task == task]
     defenses = list(dict.fromkeys(defense for defense, _ in pairs))
     pairs.sort(key=lambda pair: defenses.index(pair[0]))  # so that each photograph is protected once by each
     return runner.prepare_pairs(
-        pairs, judged.chosen or None, task=task, extractor=setting.extractor, dataset=judged.dataset, seed=setting.seed
+        pairs, judged.chosen or None, task=task, extractor=setting.extractor, dataset=judged.dataset, seed=seed
     )
 
 
-def _cell(row: Row, plans: Sequence[Plan]) -> str:
-    found = [
-        cell.head["cell_id"]
+def _cells(row: Row, plans: Sequence[Plan]) -> tuple[str, ...]:
+    return tuple(
+        str(cell.head["cell_id"])
         for plan in plans
         for cell in plan.cells
         if (plan.task, cell.defense, cell.attack) == (row.task, row.defense, row.attack)
-    ]
-    return str(found[0])
+    )
 
 
 def _columns(table: Table, ran: Ran) -> dict[Cell, pd.Series]:
-    """The values of each cell by unit, in the paper's unit of measurement."""
+    """The values of each cell by unit and seed, in the paper's unit of measurement."""
     return {
         (row.name, measure): pd.Series(
             {
-                record["unit"]: record["metrics"][wanted.metric] * wanted.times
+                f"{record['unit']} {record['seed']}": record["metrics"][wanted.metric] * wanted.times
                 for record in of(ran, row.name)
                 if record["status"] == "ok"
                 and record["metrics"].get(wanted.metric) is not None
