@@ -371,6 +371,7 @@ class Task(Plugin, ABC):
 
     attacked: ClassVar[bool]  # whether it judges what an attack makes of the release, and not the release itself
     places: ClassVar[bool] = False  # whether it is about a place, even if none is named
+    mapped: ClassVar[bool] = False  # whether it asks for the place's map
 
     @abstractmethod
     def collection(self, images: Images, dataset: Dataset | None) -> Collection:

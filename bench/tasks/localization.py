@@ -38,6 +38,7 @@ class Localization(Task):
 
     attacked: ClassVar[bool] = False
     places: ClassVar[bool] = True
+    mapped: ClassVar[bool] = True
 
     matcher: Literal["auto", "vocabulary", "mutual-nn", "point-to-subspace"] = "auto"  # auto: what serves the release best
     retrieval: Literal["raw", "released"] = "raw"
