@@ -362,6 +362,7 @@ class Outcome:
 
     metrics: Mapping[str, float | None]
     image: Floats | None = None  # (H, W, 3) in [0, 1], where one was made
+    estimates: Mapping[str, Any] = field(default_factory=dict)  # what was found that is no measure of it, such as a pose; JSON
     notes: tuple[str, ...] = ()
     spared: float = 0.0  # seconds that it would have taken longer, had nothing been kept
 

@@ -15,6 +15,7 @@ from bench.engines import Engine
 from bench.errors import UserError, unknown
 from bench.features.sift import Sift
 from bench.plugin import Asset, Dataset, Extractor
+from leaderboard import localized
 from leaderboard.reproduce import figures, report, run, tables
 from leaderboard.reproduce.drawing import Drawing, Scene, save
 from leaderboard.reproduce.profiles import Materials, Setting, profile
@@ -83,7 +84,9 @@ def reproduce(
     rebuilt = run.rebuild(table, setting, judged, folder, engine)
     report.write(rebuilt, folder)
     scene = Scene(setting=setting, judged=judged, ran=rebuilt.ran, out=folder)
-    files = [] if table.draw is None else _drawn(name, table.draw(scene), folder)
+    every = (record for records in rebuilt.ran.records.values() for record in records)
+    files = [Text(line) for line in localized.write(every, folder)]
+    files += [] if table.draw is None else _drawn(name, table.draw(scene), folder)
     return Done(out=folder, shown=(*report.to_rich(rebuilt), *files), failed=run.failures(rebuilt.ran))
 
 

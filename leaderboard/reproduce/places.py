@@ -98,5 +98,9 @@ def measures(**conditions: str | None) -> dict[str, Measure]:
 
 
 def told(condition: str | None = None) -> dict[str, Measure]:
-    """What RANSAC had to do with, means over queries."""
-    return {name: Measure(metric=name, digits=0, condition=condition) for name in ("matches", "inliers", "trials")}
+    """Median errors, in the place's unit of length and degrees, and what RANSAC had to do with, means over queries."""
+    errors = {
+        f"median_{name}": Measure(metric=name, digits=2, condition=condition, median=True)
+        for name in ("translation_error", "rotation_error")
+    }
+    return errors | {name: Measure(metric=name, digits=0, condition=condition) for name in ("matches", "inliers", "trials")}

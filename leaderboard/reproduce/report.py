@@ -221,8 +221,10 @@ def _shown(row: Row, rebuilt: Rebuilt) -> dict[str, str]:
 
 
 def _written(value: Interval, digits: int, style: str) -> str:
-    mean, low, high = (f"{number:.{digits}{style}}" for number in (value.mean, value.low, value.high))
-    return mean if value.count == 1 else f"{mean} [{low}, {high}]"
+    mean, low, high = (
+        "∞" if math.isinf(number) else f"{number:.{digits}{style}}" for number in (value.mean, value.low, value.high)
+    )
+    return mean if math.isinf(value.low) else f"{mean} [{low}, {high}]"  # of one unit alone, or a median
 
 
 def _row(row: Row, rebuilt: Rebuilt) -> dict[str, Any]:
@@ -255,4 +257,9 @@ def _evidence(evidence: Evidence) -> dict[str, Any]:
 def _fields(value: Interval | None) -> dict[str, Any]:
     if value is None:
         return {"ours": None, "low": None, "high": None, "photographs": 0}
-    return {"ours": value.mean, "low": spec.finite(value.low), "high": spec.finite(value.high), "photographs": value.count}
+    return {
+        "ours": spec.finite(value.mean),
+        "low": spec.finite(value.low),
+        "high": spec.finite(value.high),
+        "photographs": value.count,
+    }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -169,7 +170,15 @@ def failures(ran: Ran) -> int:
     return sum(record["status"] == "failed" for records in ran.records.values() for record in records)
 
 
+def _value(measure: Measure, record: Record) -> float | None:
+    value: float | None = record["metrics"].get(measure.metric)
+    worst = math.inf if measure.median and measure.metric in record["metrics"] else None
+    return worst if value is None else value
+
+
 def _interval(measure: Measure, column: pd.Series) -> Interval:
+    if measure.median:
+        return Interval(float(column.median()), -math.inf, math.inf, len(column))
     return proportion(column / measure.times, measure.times) if measure.share else interval(column)
 
 
@@ -196,11 +205,10 @@ def _columns(table: Table, ran: Ran) -> dict[Cell, pd.Series]:
     return {
         (row.name, measure): pd.Series(
             {
-                f"{record['unit']} {record['seed']}": record["metrics"][wanted.metric] * wanted.times
+                f"{record['unit']} {record['seed']}": value * wanted.times
                 for record in of(ran, row.name)
-                if record["status"] == "ok"
-                and record["metrics"].get(wanted.metric) is not None
-                and wanted.condition in (None, record.get("condition"))
+                if record["status"] == "ok" and wanted.condition in (None, record.get("condition"))
+                if (value := _value(wanted, record)) is not None
             },
             dtype=float,
         )

@@ -43,6 +43,7 @@ class Measure:
     digits: int = 3  # shown after the point
     condition: str | None = None  # of the units that count, if not all do
     share: bool = False  # whether each unit has 1 or 0 of it
+    median: bool = False  # whether it is the median over units, of which one without a value is the worst, and not their mean
 
 
 @dataclass(frozen=True, kw_only=True)
