@@ -3,6 +3,7 @@
 import csv
 import json
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -246,6 +247,29 @@ def test_what_fails_or_does_not_apply_is_said_in_every_form() -> None:
     numbers = report.numbers(rebuilt).set_index(["row", "measure"])
     assert pd.isna(numbers.loc[("none", "ssim"), "ours"])
     assert numbers.loc[("two", "ssim"), "photographs"] == 8
+
+
+def test_a_median_takes_a_unit_without_a_value_for_the_worst() -> None:
+    """And a mean leaves it out. A table that is repeated counts each seed as a unit."""
+    measures = {"mean": Measure(metric="off"), "median": Measure(metric="off", median=True)}
+    table = replace(TABLE, measures=measures, claims=lambda paper: (), ordered=None, repeated=True)
+    setting = Setting(profile=CPU, materials=Materials(), extractor=Sift(), photographs=1)
+    values = {0: 1.0, 1: None, 2: 2.0, 3: None, 4: None}
+    records: dict[str, tuple[Record, ...]] = {
+        f"seed {seed}": ({"unit": "a", "seed": seed, "status": "ok", "reason": None, "metrics": {"off": off}, "notes": []},)
+        for seed, off in values.items()
+    }
+    row = made_up_rows(setting)[0]
+    ran = Ran(rows=(row,), cells={row.name: tuple(records)}, records=records)
+    rebuilt = run.weigh(table, setting, Judged(name="place", names=("a",), available=1), ran)
+    assert rebuilt.ours["raw", "mean"].mean == 1.5
+    assert rebuilt.ours["raw", "mean"].count == 2
+    assert rebuilt.ours["raw", "median"].mean == float("inf")
+    shown = report.side_by_side(rebuilt).iloc[0]
+    assert shown["median"] == "∞"
+    assert shown["n"] == "2/5"
+    assert "seeds 0 to 5" in report.heading(rebuilt)
+    assert json.loads(json.dumps(report.plain(rebuilt), allow_nan=False))["rows"][0]["ours"]["median"]["ours"] == "inf"
 
 
 def test_the_order_of_the_paper_is_confirmed_where_it_is_there() -> None:
