@@ -81,6 +81,11 @@ def test_smoke(name: str, images: Path, out: Path, capsys: pytest.CaptureFixture
         assert claim["verdict"] == "cannot tell"  # of two photographs nothing can be told
         assert claim["statements"]
     assert found["title"] in printed
+    if tables.everything()[name].draw is not None:
+        drawn = sorted((out / "figures").glob(f"{name}-*"))
+        assert {file.suffix for file in drawn} == {".png", ".pdf"}
+        assert all(str(file) in printed for file in drawn)
+        assert np.asarray(Image.open(drawn[1]).convert("L")).std() > 5  # something is drawn
     cells = list(csv.DictReader((out / f"{name}.csv").open(encoding="utf-8")))
     assert len(cells) == len(found["rows"]) * len(tables.everything()[name].measures)
     statements = list(csv.DictReader((out / f"{name}-claims.csv").open(encoding="utf-8")))
