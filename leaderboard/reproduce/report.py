@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -110,7 +110,8 @@ def to_rich(rebuilt: Rebuilt) -> Iterator[RichTable]:
 
 def side_by_side(rebuilt: Rebuilt) -> pd.DataFrame:
     """Paper and ours as text, a row for each row; those borrowed from other tables come last."""
-    rows = [_shown(row, rebuilt) for row in rebuilt.ran.rows]
+    printed = {measure for row in rebuilt.ran.rows for measure in row.paper}
+    rows = [_shown(row, rebuilt, printed) for row in rebuilt.ran.rows]
     frame = pd.DataFrame(rows).fillna("")
     frame["note"] = [rebuilt.notes[row.name] for row in rebuilt.ran.rows]
     return frame if frame["note"].any() else frame.drop(columns="note")
@@ -206,14 +207,15 @@ def _sentence(evidence: Evidence) -> str:
     return f"{evidence.verdict.value}: {evidence.statement.text}: {paper}{ours}{reason}"
 
 
-def _shown(row: Row, rebuilt: Rebuilt) -> dict[str, str]:
+def _shown(row: Row, rebuilt: Rebuilt, printed: Container[str]) -> dict[str, str]:
+    """`printed` are the measures that the paper has of some row."""
     cells: dict[str, str] = dict(row.labels)
     counts = set()
     for measure, wanted in rebuilt.table.measures.items():
         ours = rebuilt.ours.get((row.name, measure))
         if measure in row.paper:
             cells[f"{measure}, paper"] = f"{row.paper[measure]:.{wanted.digits}f}"
-        cells[f"{measure}, ours" if measure in row.paper else measure] = (
+        cells[f"{measure}, ours" if measure in printed else measure] = (
             "n/a" if ours is None else _written(ours, wanted.digits, "f")
         )
         counts |= set() if ours is None else {ours.count}

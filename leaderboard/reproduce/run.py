@@ -220,7 +220,11 @@ def _columns(table: Table, ran: Ran) -> dict[Cell, pd.Series]:
 def _correlation(table: Table, rows: Iterable[Row], ours: Mapping[Cell, Interval]) -> float | None:
     if table.ordered is None:
         return None
-    both = [(row.paper[table.ordered], ours[row.name, table.ordered].mean) for row in rows if (row.name, table.ordered) in ours]
+    both = [
+        (row.paper[table.ordered], ours[row.name, table.ordered].mean)
+        for row in rows
+        if table.ordered in row.paper and (row.name, table.ordered) in ours
+    ]
     return rank_correlation(*zip(*both, strict=True)) if len(both) > 1 else None
 
 
