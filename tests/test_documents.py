@@ -28,6 +28,10 @@ SMALLER = {
 # Another test runs it: it needs what that test makes.
 ELSEWHERE = {
     "reproduce table1 --profile smoke": "test_reproduce.py, and .ci/run as it stands",
+    "run --task localization --defense none --dataset aachen:path=aachen/ --out runs/aachen": "test_localization.py",
+    "run --task localization:pairs=runs/aachen/pairs.txt --defense none --dataset aachen:path=aachen/ --out runs/pairs": (
+        "test_localization.py"
+    ),
     "run --defense my-defense --attack keypoints": "test_skeleton.py, with the package installed",
     "audit --defense ldp:epsilon=1/3,subset_size=1 --words 3 --trials 20000": "test_guarantee.py",
 }
