@@ -91,6 +91,8 @@ class Defense(Plugin, ABC):
     # its words are used.
     quantised_by: ClassVar[str | None] = None
     truncated_by: ClassVar[str | None] = None
+    # Whether the descriptors that it releases are buried in noise.
+    noisy: ClassVar[bool] = False
 
     @abstractmethod
     def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> Release:

@@ -56,6 +56,7 @@ class PrivUnit(Defense):
 
     releases = Descriptors
     serves: ClassVar[Mapping[str, Between | OneOf]] = {"epsilon": Between(4.0, 32.0)}
+    noisy: ClassVar[bool] = True
 
     epsilon: float = 10.0  # nats, per descriptor
     centred: bool = True  # whether the mean direction of the dictionary's words is taken out first

@@ -56,6 +56,7 @@ class Matcher(ABC):
 
     accepts: ClassVar[tuple[type[Release], ...]]
     by_words: ClassVar[bool] = False  # whether it needs the words of the map's keypoints
+    for_noise: ClassVar[bool] = False  # whether it is for descriptors that a defense buries in noise, and for no others
 
     @abstractmethod
     def match(self, release: Release, retrieved: Retrieved) -> Correspondences:
@@ -104,6 +105,16 @@ class MutualNN(Matcher):
 
 
 @dataclass(frozen=True, kw_only=True)
+class NoisyNN(MutualNN):
+    """The same without Lowe's test: what is buried in noise is nearly as far from its nearest as from its second nearest."""
+
+    accepts = (Descriptors,)
+    for_noise = True
+
+    ratio: float = 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
 class PointToSubspace(Matcher):
     """Mutually nearest by the distance of a reference's descriptor from a subspace (Dusmanu et al., CVPR 2021)."""
 
@@ -117,7 +128,12 @@ class PointToSubspace(Matcher):
         return distinct(*_nearest(retrieved, lambda theirs: subspaces_to_points(release, theirs), self.ratio), retrieved.map)
 
 
-MATCHERS: dict[str, type[Matcher]] = {"vocabulary": Vocabulary, "mutual-nn": MutualNN, "point-to-subspace": PointToSubspace}
+MATCHERS: dict[str, type[Matcher]] = {
+    "vocabulary": Vocabulary,
+    "noisy-nn": NoisyNN,
+    "mutual-nn": MutualNN,
+    "point-to-subspace": PointToSubspace,
+}
 
 
 def inapplicable(name: str, defense: Defense) -> str | None:
@@ -128,6 +144,8 @@ def inapplicable(name: str, defense: Defense) -> str | None:
         return f"{name} matches {accepted}; {defense.name()} releases {defense.releases.__name__}"
     if matcher.by_words and defense.quantised_by is None:
         return f"{name} matches words of a dictionary; {defense.name()} has none"
+    if matcher.for_noise and not defense.noisy:
+        return f"{name} matches descriptors that are buried in noise; those of {defense.name()} are not"
     return None
 
 

@@ -39,7 +39,8 @@ class Localization(Task):
     attacked: ClassVar[bool] = False
     places: ClassVar[bool] = True
 
-    matcher: Literal["auto", "vocabulary", "mutual-nn", "point-to-subspace"] = "auto"  # auto: what serves the release best
+    # auto: what serves the release best
+    matcher: Literal["auto", "vocabulary", "noisy-nn", "mutual-nn", "point-to-subspace"] = "auto"
     retrieval: Literal["raw", "released"] = "raw"
     retrieved: int = 20  # references of a query
     trials: int = 30_000  # of RANSAC, at most
