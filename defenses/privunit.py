@@ -69,7 +69,7 @@ class PrivUnit(Defense):
     def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> Descriptors:
         mean = public.dictionary(self.dictionary).mean[None] if self.centred else None  # (1, D)
         drawn = near(without(secret.descriptors.astype(np.float64), mean), mean, self.epsilon, rng)
-        released = unit_rows(np.rint(drawn / GRID) * GRID)
+        released = unit_rows((np.rint(drawn / GRID) * GRID).astype(np.float32))
         return Descriptors(keypoints=secret.keypoints.copy(), size=secret.size, descriptors=released)
 
     def privacy(self, public: Public) -> Privacy:

@@ -91,7 +91,7 @@ class Vocabulary(Matcher):
 class MutualNN(Matcher):
     """Mutually nearest descriptors; the candidates of a set count as if each had been seen."""
 
-    accepts = (Descriptors, WordSets)
+    accepts: ClassVar[tuple[type[Release], ...]] = (Descriptors, WordSets)
 
     ratio: float = RATIO
 
