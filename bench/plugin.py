@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from fractions import Fraction
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, final
 
 import numpy as np
@@ -60,9 +61,11 @@ class OneOf:
 class Privacy:
     """What a defense promises of one descriptor."""
 
-    guarantee: str  # "none", "epsilon-ldp", "epsilon-ldp-by-word" of a defense that remembers, ...
+    guarantee: str  # "none", "epsilon-ldp", "epsilon-ldp-by-word" of a defense that remembers, "d-chi", ...
     epsilon: float | None = None  # nats, of one descriptor; None where nothing is promised
     log10_true: float | None = None  # log10 of the chance that the true word is in its set
+    # Nats per unit of distance, where descriptors are promised to be hidden among near ones ("d-chi"): nothing to compare ε with.
+    per_distance: float | None = None
 
 
 class Plugin:
@@ -88,6 +91,8 @@ class Defense(Plugin, ABC):
     # its words are used.
     quantised_by: ClassVar[str | None] = None
     truncated_by: ClassVar[str | None] = None
+    # Whether the descriptors that it releases are buried in noise.
+    noisy: ClassVar[bool] = False
 
     @abstractmethod
     def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> Release:
@@ -96,6 +101,10 @@ class Defense(Plugin, ABC):
     @abstractmethod
     def privacy(self, public: Public) -> Privacy:
         """What is promised of one descriptor, and where it can be computed, the chance that it is told."""
+
+    def distance(self, secret: Features, public: Public, one: int, other: int) -> Fraction:
+        """How far apart the promise takes two of these descriptors to be: ε-LDP treats all alike. One's own distance is 0."""
+        return Fraction(int(one != other))
 
     def remembers(self) -> bool:
         """Whether one device gives equal descriptors equal answers. `rng` then is the device: in the same state at each call."""

@@ -232,9 +232,11 @@ def privacy(cell: Cell, keypoints: int | None) -> dict[str, Any]:
         answers = keypoints * releases
         spent["epsilon_image"] = spec.finite(composition.basic(epsilon, answers))
         spent["epsilon_image_optimal"] = spec.finite(composition.optimal(epsilon, answers))
+    by_distance = cell.privacy.per_distance
     return {
         "guarantee": cell.privacy.guarantee,
         "epsilon_descriptor": spec.finite(epsilon),
+        **({} if by_distance is None else {"epsilon_per_distance": float(by_distance)}),
         "keypoints": keypoints,
         "releases": releases,  # of the photograph
         **spent,

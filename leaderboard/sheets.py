@@ -173,8 +173,9 @@ def latex(text: str) -> str:
 
 def guarantee(record: Record) -> str:
     """What a defense promises, in words."""
-    name = str(record["privacy"]["guarantee"])
-    return _GUARANTEES.get(name, name)
+    name, by_distance = str(record["privacy"]["guarantee"]), record["privacy"].get("epsilon_per_distance")
+    told = _GUARANTEES.get(name, name)
+    return told if by_distance is None else f"{told}, ε = {number(by_distance)} per unit of distance"
 
 
 def _columns(board: Board) -> tuple[Column, ...]:

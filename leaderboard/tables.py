@@ -236,7 +236,9 @@ def _notes(cell: list[Record]) -> list[str]:
     uncovered = [part for part in cell[0]["privacy"].get("uncovered", ()) if part not in UNCOVERED]
     shared = [note for note in (done[0]["notes"] if done else []) if all(note in record["notes"] for record in done)]
     beyond = [f"not covered either: {', '.join(uncovered)}"] if uncovered else []
-    return [*shared, *beyond] if done else ["no photograph could be done"]
+    by_distance = cell[0]["privacy"].get("epsilon_per_distance")
+    other = [] if by_distance is None else [f"another promise than ε-LDP: ε = {number(by_distance)} per unit of distance"]
+    return [*other, *shared, *beyond] if done else ["no photograph could be done"]
 
 
 def spent(privacy: dict[str, Any]) -> float | None:

@@ -1,4 +1,4 @@
-"""What the strongest attacker sees of a query, beside whether the server localizes it: the same images, words, ε and m for both."""
+"""What the strongest attacker sees of a query, beside whether the server localizes it: same images, words, ε and m for both."""
 
 from attacks.dia import DIA
 from attacks.keypoints import Keypoints

@@ -33,6 +33,13 @@ def test_arrays_choices_and_permutations() -> None:
     assert pairs == dict.fromkeys(itertools.permutations((5, 6, 7), 2), Fraction(1, 6))
 
 
+def test_draws_from_many_ranges_at_once() -> None:
+    found = law(lambda rng: tuple(rng.integers(np.array([2, 3])).tolist())).chances
+    assert found == dict.fromkeys(itertools.product(range(2), range(3)), Fraction(1, 6))
+    dice = law(lambda rng: tuple(rng.integers(1, np.array([[2], [2]]), endpoint=True).ravel().tolist())).chances
+    assert dice == dict.fromkeys(itertools.product((1, 2), repeat=2), Fraction(1, 4))
+
+
 def test_doubles_are_exact() -> None:
     """0.3 is no multiple of 2^-53, and rng.random() < 0.3 has a probability that is."""
     found = law(lambda rng: bool(rng.random() < 0.3))
@@ -80,7 +87,7 @@ def test_greatest_ratio() -> None:
     [
         (lambda rng: rng.normal(), r"rng\.normal"),
         (lambda rng: rng.choice(2, p=[0.2, 0.8]), "weights"),
-        (lambda rng: rng.integers(np.array([2, 3])), "many ranges"),
+        (lambda rng: rng.integers(np.array([2, 3]), size=2), "many ranges"),
         (lambda rng: tuple(rng.integers(10, size=9).tolist()), "too many courses"),
         (lambda rng: int(rng.integers(2**40)) % 2, "thresholds"),
         (

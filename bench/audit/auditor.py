@@ -13,6 +13,9 @@ What `protect` does with a descriptor, the quantiser included, is a black box.
 The last two compare (d1, d1) with (d1, d2): one descriptor changes, so ε bounds these ratios, too. A defense that remembers does
 not promise that. All pairs of words are compared by enumeration, where the dictionary is small.
 
+Where the promise depends on how far descriptors are apart, all bounds are divided by the distance of the two, and ε is per unit
+of it.
+
 Many keypoints of one call count as many trials, which presumes that a keypoint's answer depends on its own descriptor and on
 chance. Where answers of one call are more alike than that allows, one keypoint of each call counts and the others do not.
 """
@@ -23,6 +26,7 @@ import dataclasses
 from collections.abc import Iterator
 from decimal import Context, Decimal
 from fractions import Fraction
+from itertools import combinations
 from pathlib import Path
 from typing import Literal
 
@@ -55,7 +59,7 @@ ALIKE = "{}: answers of one call are more alike than independent ones, so that o
 
 @dataclasses.dataclass(frozen=True)
 class Enumeration:
-    """Bounds of ln of the greatest ratio of an output's probabilities for two words."""
+    """Bounds of the greatest ln of the ratio of an output's probabilities for two words, over the distance of the two."""
 
     low: float
     high: float  # infinite where a probability is too small to be told from 0
@@ -67,6 +71,7 @@ class Audit:
     """All findings, and what follows from them."""
 
     claimed: float
+    by_distance: bool  # whether that, and all bounds, are per unit of distance
     findings: tuple[Finding, ...]
     enumeration: Enumeration | None
     notes: tuple[str, ...]
@@ -101,13 +106,16 @@ def audit(defense: Defense, words: int | None, trials: int, seed: int, folder: P
     public = Public()
     if words is not None:
         defense = _reporting_from(defense, words, seed, folder)
-    claimed = defense.privacy(public).epsilon
+    promised = defense.privacy(public)
+    claimed = promised.per_distance if promised.epsilon is None else promised.epsilon
     if claimed is None:
         raise UserError(f"{defense.name()}, as configured, claims no epsilon: there is nothing to audit")
     if trials < 4:
         raise UserError(f"an audit needs at least 4 trials, got {trials}")
     secrets = example_features(2, seed) if words is None else near_words(defense, public)
-    findings = tuple(_findings(defense, secrets.take(np.array([0, len(secrets) - 1])), public, trials, seed))
+    tried = secrets.take(np.array([0, len(secrets) - 1]))
+    apart = float(defense.distance(tried, public, 0, 1))
+    findings = tuple(finding.per(apart) for finding in _findings(defense, tried, public, trials, seed))
     notes = [LINKED] if defense.remembers() else []
     if alike := [finding.family for finding in findings if finding.alike]:
         notes.append(ALIKE.format(", ".join(alike)))
@@ -120,7 +128,7 @@ def audit(defense: Defense, words: int | None, trials: int, seed: int, folder: P
         enumeration = enumerated(defense, secrets, public, claimed)
     except NotEnumerableError as reason:
         notes.append(f"outputs were not enumerated: {reason}")
-    return Audit(claimed, findings, enumeration, tuple(notes))
+    return Audit(claimed, promised.epsilon is None, findings, enumeration, tuple(notes))
 
 
 def near_words(defense: Defense, public: Public) -> Features:
@@ -146,7 +154,14 @@ def enumerated(defense: Defense, secrets: Features, public: Public, claimed: flo
         return answers(defense.protect(secrets.take(np.array([number])), public, rng)).words.tobytes()
 
     laws = [law(lambda rng, number=number: released(number, rng), RUNS) for number in range(len(secrets))]  # type: ignore[misc]
-    low, high = (Decimal("inf") if ratio is None else _quotient(ratio).ln(DIGITS) for ratio in greatest_ratio(laws))
+    low = high = Decimal(0)
+    for one, other in combinations(range(len(laws)), 2):
+        apart = _quotient(defense.distance(secrets, public, one, other))
+        bounds = (
+            Decimal("inf") if each is None else _quotient(each).ln(DIGITS) for each in greatest_ratio([laws[one], laws[other]])
+        )
+        least, most = (DIGITS.divide(bound, apart) for bound in bounds)
+        low, high = max(low, least), max(high, most)
     return Enumeration(float(low), float(high), low > _quotient(exact(claimed)))
 
 

@@ -165,7 +165,11 @@ class _Player:
 
     def integers(self, low: Any, high: Any = None, size: Any = None, dtype: Any = np.int64, endpoint: bool = False) -> Any:
         if np.ndim(low) or np.ndim(high):
-            raise NotEnumerableError("it draws by rng.integers from many ranges at once, which is not played")
+            if size is not None:
+                raise NotEnumerableError("it draws by rng.integers from many ranges in a given shape, which is not played")
+            ranges = np.broadcast(low, low if high is None else high)
+            each = [self.integers(0 if high is None else one, other, endpoint=endpoint) for one, other in ranges]
+            return np.array(each, dtype=dtype).reshape(ranges.shape)
         first, end = (0, int(low)) if high is None else (int(low), int(high))
         return self._array(lambda: first + self._number(end - first + endpoint), size, dtype)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,10 @@ class Finding:
     certain: float  # at least, with CERTAINTY
     expected: float  # the bound on the half of the calls by which the event was chosen
     alike: bool  # whether answers of one call were too much alike, so that one of each call was counted
+
+    def per(self, distance: float) -> Finding:
+        """The same, with bounds per unit of the distance that the two inputs are apart."""
+        return replace(self, epsilon=self.epsilon / distance, certain=self.certain / distance, expected=self.expected / distance)
 
 
 @dataclass(eq=False)

@@ -13,15 +13,16 @@ from bench.audit.findings import CERTAINTY, CONFIDENCE
 
 def report(found: Audit, defense: str) -> Iterator[Text | Table]:
     """The findings and the verdict."""
+    unit = " per unit of distance" if found.by_distance else ""
     table = Table(
-        title=Text(f"{defense} claims ε = {found.claimed:g}"),
+        title=Text(f"{defense} claims ε = {found.claimed:g}{unit}"),
         caption=Text("\n".join(found.notes)),
         title_justify="left",
         caption_justify="left",
     )
     for column in ("events", "the most telling"):
         table.add_column(column, overflow="fold")
-    for column in ("rate", "rate for the other", "trials of each", f"ε at least ({CONFIDENCE:.0%})"):
+    for column in ("rate", "rate for the other", "trials of each", f"ε{unit} at least ({CONFIDENCE:.0%})"):
         table.add_column(column, justify="right")
     for finding in found.findings:
         one, other = finding.rates
@@ -30,9 +31,11 @@ def report(found: Audit, defense: str) -> Iterator[Text | Table]:
         )
     yield table
     if found.enumeration is not None:
+        least, most = found.enumeration.low, found.enumeration.high
+        power = "e^(ε d)" if found.by_distance else "e^ε"
         yield Text(
-            "all outputs enumerated: the greatest ratio of two words' probabilities is e^ε "
-            f"for ε from {found.enumeration.low:.15g} to {found.enumeration.high:.15g}"
+            "all outputs enumerated: the greatest ratio of two words' probabilities is "
+            f"{power} for ε from {least:.15g} to {most:.15g}"
         )
     bound = f"ε is at least {found.strongest.epsilon:.4f} with confidence {CONFIDENCE:.0%}, by {found.strongest.family}"
     yield Text(f"{bound}: {_judgement(found)}")

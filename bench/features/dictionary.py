@@ -12,9 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bench import tensorfile
 from bench.errors import UserError
+from bench.kernels.neighbours import Neighbours
 from bench.kernels.search import WordIndex
 from bench.types import Bytes
 
@@ -41,6 +43,18 @@ class Dictionary:
     def index(self) -> WordIndex:
         """Finds the nearest words of descriptors."""
         return WordIndex(self.words)
+
+    @cached_property
+    def neighbours(self) -> Neighbours:
+        """Finds words that are near to words."""
+        return Neighbours(self.words)
+
+    @cached_property
+    def mean(self) -> NDArray[np.float64]:
+        """The direction of the mean of the unit words. -> (D,)"""
+        lengths = np.linalg.norm(self.words.astype(np.float32), axis=1).astype(np.float64)
+        total = (1 / lengths) @ self.words  # 8-bit numbers weighed in float64
+        return total / np.linalg.norm(total)
 
     def first(self, count: int) -> Dictionary:
         """The dictionary of the first `count` words, or of all: rows are in random order, so that they are as good as any."""

@@ -57,6 +57,7 @@ class Matcher(ABC):
 
     accepts: ClassVar[tuple[type[Release], ...]]
     by_words: ClassVar[bool] = False  # whether it needs the words of the map's keypoints
+    for_noise: ClassVar[bool] = False  # whether it is for descriptors that a defense buries in noise, and for no others
 
     @abstractmethod
     def match(self, release: Release, retrieved: Retrieved) -> Correspondences:
@@ -91,7 +92,7 @@ class Vocabulary(Matcher):
 class MutualNN(Matcher):
     """Mutually nearest descriptors; the candidates of a set count as if each had been seen."""
 
-    accepts = (Descriptors, WordSets)
+    accepts: ClassVar[tuple[type[Release], ...]] = (Descriptors, WordSets)
 
     ratio: float = RATIO
 
@@ -102,6 +103,16 @@ class MutualNN(Matcher):
         mine = torch.from_numpy(sets.reshape(-1, sets.shape[2])).to(pick_device())
         rows, seen = _nearest(retrieved, lambda reference: points_to_points(mine, _points(retrieved, reference)), self.ratio)
         return distinct(rows // sets.shape[1], seen, retrieved.map)
+
+
+@dataclass(frozen=True, kw_only=True)
+class NoisyNN(MutualNN):
+    """The same without Lowe's test: what is buried in noise is nearly as far from its nearest as from its second nearest."""
+
+    accepts = (Descriptors,)
+    for_noise = True
+
+    ratio: float = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,6 +150,7 @@ class SubspaceToSubspace(Matcher):
 
 MATCHERS: dict[str, type[Matcher]] = {
     "vocabulary": Vocabulary,
+    "noisy-nn": NoisyNN,
     "mutual-nn": MutualNN,
     "point-to-subspace": PointToSubspace,
     "subspace-to-subspace": SubspaceToSubspace,
@@ -153,6 +165,8 @@ def inapplicable(name: str, defense: Defense) -> str | None:
         return f"{name} matches {accepted}; {defense.name()} releases {defense.releases.__name__}"
     if matcher.by_words and defense.quantised_by is None:
         return f"{name} matches words of a dictionary; {defense.name()} has none"
+    if matcher.for_noise and not defense.noisy:
+        return f"{name} matches descriptors that are buried in noise; those of {defense.name()} are not"
     return None
 
 

@@ -42,7 +42,7 @@ class Localization(Task):
     mapped: ClassVar[bool] = True
 
     # auto: what serves the release best, where references are not lifted
-    matcher: Literal["auto", "vocabulary", "mutual-nn", "point-to-subspace", "subspace-to-subspace"] = "auto"
+    matcher: Literal["auto", "vocabulary", "noisy-nn", "mutual-nn", "point-to-subspace", "subspace-to-subspace"] = "auto"
     retrieval: Literal["raw", "released"] = "raw"
     retrieved: int = 20  # references of a query
     trials: int = 30_000  # of RANSAC, at most
