@@ -49,8 +49,8 @@ def test_nothing_that_is_tuned_or_reported_on_made_a_dictionary(public, shared_d
 @pytest.mark.parametrize("path", NETWORKS, ids=lambda path: path.stem)
 def test_networks_were_trained_alike_and_as_the_rule_demands(path):
     meta = weights.load(path).meta
-    assert meta["crops"] == weights.load(NETWORKS[0]).meta["crops"], "unequal training makes an unfair comparison"
-    assert meta["photographs"] == 800
+    for what in ("start", "crops", "photographs"):
+        assert meta[what] == weights.load(NETWORKS[0]).meta[what], "unequal training makes an unfair comparison"
     if meta["quantisation_error"] is not None:
         check_quantisation(meta["quantisation_error"]["training"], meta["quantisation_error"]["validation"])
 
