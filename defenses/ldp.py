@@ -32,9 +32,9 @@ class LDP(Defense):
 
     releases = WordSets
     serves: ClassVar[Mapping[str, Between | OneOf]] = {
-        "epsilon": Between(8.0, 16.0),
+        "epsilon": Between(6.0, 16.0),
         "subset_size": OneOf((1, 2, 3, 4)),
-        "words": OneOf((0, 128_000)),
+        "words": OneOf((0, 128_000, 8_000)),  # those of the scaled tables
     }
     quantised_by: ClassVar[str | None] = "dictionary"
     truncated_by: ClassVar[str | None] = "words"

@@ -43,10 +43,10 @@ def texture(seed: int, size: tuple[int, int] = (80, 64)) -> Image.Image:
     return Image.fromarray(noise).filter(ImageFilter.GaussianBlur(2))
 
 
-def album(folder: Path, count: int = 2) -> Path:
-    """A folder of photographs."""
+def album(folder: Path, count: int = 2, first: int = 0) -> Path:
+    """A folder of photographs; those with other numbers are others."""
     folder.mkdir(parents=True, exist_ok=True)
-    for number in range(count):
+    for number in range(first, first + count):
         texture(number).save(folder / f"{number}.png")
     return folder
 

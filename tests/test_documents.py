@@ -5,7 +5,6 @@ Some are run in a smaller form, or not at all; SMALLER and ELSEWHERE say which, 
 
 import re
 import shlex
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -15,7 +14,8 @@ from bench import cli, skeleton
 from bench.cli import parser
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = ("method", "formats", "extending", "scale")
+PAGES = {name: ROOT / f"{name}.md" for name in ("README", "docs/method", "docs/formats", "docs/extending", "docs/scale")}
+FEW_VIEWS = "gallery:views=9,queries=2,rooms=1"
 
 # Run with more options, or fewer images, so that it takes seconds.
 SMALLER = {
@@ -24,6 +24,17 @@ SMALLER = {
     "train --defense none --images photos/ --out W.safetensors --log logs/": "--steps 1 --batch 1 --widths 8,8",
     "export --images photos/ --defense affine --attack nearest --layout hloc --out recovered.h5": "--images one/",
     "scale --markdown": "--words 1000",
+    "run --defense none --defense affine --defense ldp:epsilon=16 --defense ldp --attack dia --attack nearest": "--images one/",
+    "dictionary build --images photos/ --size 256000 --out K.safetensors": "--size 64",
+    "train --defense ldp:dictionary=K.safetensors --images other-photos/ --out W.safetensors": (
+        "--validation unseen/ --steps 1 --batch 1 --widths 8,8"
+    ),
+    "run --task matching --defense none --defense ldp --defense affine": "--task matching:each=1",
+    "run --task localization --defense none --defense ldp:epsilon=6.534,words=8000 --workers 2": f"--dataset {FEW_VIEWS}",
+    "run --task localization --defense affine --dataset colmap:path=mine/": "--dataset colmap:path=gallery/",
+    "dataset gallery --layout colmap --views 300 --queries 300 --out gallery/": "gallery:rooms=1 --views 9 --queries 2",
+    "scale": "--words 1000",
+    "sweep smoke": "--images one/",
 }
 # Another test runs it: it needs what that test makes.
 ELSEWHERE = {
@@ -32,27 +43,37 @@ ELSEWHERE = {
     "run --task localization:pairs=runs/aachen/pairs.txt --defense none --dataset aachen:path=aachen/ --out runs/pairs": (
         "test_localization.py"
     ),
+    "reproduce table4 --profile smoke": "test_reproduce.py, and .ci/run as it stands",
+    "reproduce table1": "test_reproduce.py, and .ci/run by the profile smoke",
+    "reproduce table2": "test_reproduce.py, and .ci/run by the profile smoke",
+    "audit --defense ldp:epsilon=2,subset_size=2 --words 64 --trials 1000000": "test_guarantee.py",
+    (
+        "run --task structure --defense none --defense ldp:words=256000,epsilon=9.307,subset_size=16 "
+        "--extractor sift:max_keypoints=2000"
+    ): "test_structure.py and test_reproduce.py, with fewer words",
     "run --defense my-defense --attack keypoints": "test_skeleton.py, with the package installed",
     "audit --defense ldp:epsilon=1/3,subset_size=1 --words 3 --trials 20000": "test_guarantee.py",
 }
 
 
 def commands(page: str) -> list[str]:
-    text = (ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8")
-    return re.findall(r"^bench (.+)$", text, re.MULTILINE)
+    """What a page shows, without the remarks beside it."""
+    text = PAGES[page].read_text(encoding="utf-8")
+    return re.findall(r"^(?:\.venv/bin/)?bench (.+?)(?:\s+#.*)?$", text, re.MULTILINE)
 
 
-@pytest.fixture(scope="module")
-def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Photographs, results and a baseline, as whoever reads the documents has them."""
-    folder = tmp_path_factory.mktemp("documents")
-    album(folder / "photos", 3)
-    album(folder / "one", 1)
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.chdir(folder)
-        assert cli.main(shlex.split("run --defense none --attack keypoints --images photos/ --out runs/x")) == 0
-        (folder / "baseline.jsonl").write_bytes((folder / "runs" / "x" / "records.jsonl").read_bytes())
-        yield folder
+    album(tmp_path / "photos", 3)
+    album(tmp_path / "one", 1)
+    album(tmp_path / "other-photos", 3, first=3)
+    album(tmp_path / "unseen", 3, first=6)
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(shlex.split("run --defense none --attack keypoints --images photos/ --out runs/x")) == 0
+    for name in ("baseline.jsonl", "theirs.jsonl"):
+        (tmp_path / name).write_bytes((tmp_path / "runs" / "x" / "records.jsonl").read_bytes())
+    return tmp_path
 
 
 @pytest.mark.parametrize("page", PAGES)
@@ -72,7 +93,8 @@ def arguments(command: str) -> list[str]:
     if command in ELSEWHERE:
         return ["list", "metrics"]
     if command.startswith("dataset gallery"):
-        return [SMALLER[command] if word == "gallery" else word for word in words]
+        smaller, *more = shlex.split(SMALLER[command])
+        return [smaller if word == "gallery" else word for word in words] + more
     if command.startswith("submit-check"):
         return [*words, "--images", "photos/"]
     return [*words, *shlex.split(SMALLER.get(command, ""))]
@@ -84,7 +106,7 @@ def test_what_is_said_of_commands_is_of_commands_that_are_there() -> None:
 
 
 def test_all_kinds_of_plugins_are_shown() -> None:
-    assert {command.split()[1] for command in commands("extending") if command.startswith("new ")} == set(skeleton.KINDS)
+    assert {command.split()[1] for command in commands("docs/extending") if command.startswith("new ")} == set(skeleton.KINDS)
 
 
 def test_targets_of_make_are_there() -> None:

@@ -3,7 +3,8 @@
 The photographs of `train/` that are in neither list are parted by name into three thirds. The dictionary is made from the first
 two thirds, the attacker's public database from the last. Two more dictionaries, each made from another two thirds, quantise the
 photographs that the shipped dictionary was made from while networks are trained; they are not shipped. All networks start from
-one that was trained on raw descriptors, and are then trained equally long for their own releases.
+one that was trained on raw descriptors, at one rate and then at half of it, and are then trained equally long for their own
+releases.
 """
 
 from __future__ import annotations
@@ -16,8 +17,7 @@ from bench.cli import main as bench
 from bench.public import ASSETS
 
 WORDS, PUBLIC_WORDS = 256_000, 128_000
-# As the shipped networks were trained. The one for LDP-Feat knows the whole dictionary and reads sets in their order.
-DEFENSES = {"none": ["none"], "affine": ["affine"], "ldp": ["ldp:words=0", "--encoding", "released"]}
+DEFENSES = ("none", "affine", "ldp")
 NARROW = "32,64,128,192,192"  # channels of the network for positions, so that all files together stay small
 
 
@@ -26,7 +26,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--work", type=Path, required=True, help="kept between runs; what is done is not done again")
     parser.add_argument(
-        "--steps", type=int, default=1000, help="of each network's own training; the common start has four times as many"
+        "--steps", type=int, default=1000, help="of each network's own training; the common start has five times as many"
     )
     args = parser.parse_args()
     folders = part(args.data, args.work / "photographs")
@@ -37,15 +37,16 @@ def main() -> None:
     shutil.copyfile(dictionaries["01"], ASSETS / "dictionary.safetensors")
     shutil.copyfile(dictionaries["2"], ASSETS / "public-database.safetensors")
     given = ["--images", folders["012"], "--validation", folders["tune"]]
-    start = args.work / "start.safetensors"
+    first, start = args.work / "first.safetensors", args.work / "start.safetensors"
+    further = ["--steps", args.steps, "--rate", 1e-3]
     if not start.is_file():
-        run("train", "--defense", "none", *given, "--steps", 4 * args.steps, "--out", start)
-    for name, defense in DEFENSES.items():
+        run("train", "--defense", "none", *given, "--steps", 4 * args.steps, "--out", first)
+        run("train", "--defense", "none", *given, "--start", first, *further, "--out", start)
+    for name in DEFENSES:
         network = args.work / f"inversion-{name}.safetensors"
         if not network.is_file():
             crossfit = ["--crossfit", dictionaries["02"], "--crossfit", dictionaries["12"]]
-            further = ["--start", start, "--steps", args.steps, "--rate", 1e-3]
-            run("train", "--defense", *defense, *given, *crossfit, *further, "--out", network)
+            run("train", "--defense", name, *given, *crossfit, "--start", start, *further, "--seed", 1, "--out", network)
         shutil.copyfile(network, ASSETS / network.name)
     positions = args.work / "positions.safetensors"
     if not positions.is_file():

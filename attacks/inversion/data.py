@@ -143,12 +143,17 @@ def queries(features: Features) -> Bytes | Floats:
     return features.descriptors if features.codes is None else features.codes
 
 
-def quantisation_error(views: Sequence[PhotographView], dictionaries: Mapping[str, Asset], public: Public) -> float:
-    """Mean distance between unit descriptors and their unit words, over the views of 256 x 256 pixels."""
+def quantisation_error(
+    views: Sequence[PhotographView], dictionaries: Mapping[str, Asset], public: Public, words: int = 0
+) -> float:
+    """Mean distance between unit descriptors and their unit words, the first `words` of each dictionary (0: all of them).
+
+    Views of 256 x 256 pixels count.
+    """
     distances = []
     for view in views:
         if len(view.pixels) == SIDE:
             known = dictionaries[view.photograph]
-            words = public.dictionary(known).words[public.nearest_words(known, view.features)]
-            distances.append(np.linalg.norm(unit_rows(words) - view.features.descriptors, axis=1))
+            nearest = public.dictionary(known).words[public.nearest_words(known, view.features, words)]
+            distances.append(np.linalg.norm(unit_rows(nearest) - view.features.descriptors, axis=1))
     return float(np.concatenate(distances).mean())

@@ -148,23 +148,25 @@ def _examples(
     plain = Public()
     chosen = fitting_dictionaries({view.photograph for view in views}, [own, *crossfit], plain)
     chosen_unseen = fitting_dictionaries({view.photograph for view in unseen}, [own], plain)
-    public = Public(quantise(views, chosen, sorted({0, *_sizes(defense, served)}), plain), remembered=0)
+    sizes = _sizes(defense, served)
+    public = Public(quantise(views, chosen, sizes, plain), remembered=0)
     examples, held_out = Examples(views, defense, served, chosen, public), Examples(unseen, defense, served, chosen_unseen, plain)
     upright = [view for view in views if len(view.pixels) == SIDE][::2]
     errors = {
-        "training": quantisation_error(upright, chosen, public),
-        "validation": quantisation_error(unseen, chosen_unseen, plain),
+        "training": quantisation_error(upright, chosen, public, sizes[0]),
+        "validation": quantisation_error(unseen, chosen_unseen, plain, sizes[0]),
     }
     check_quantisation(errors["training"], errors["validation"])
     return examples, held_out, errors
 
 
 def _sizes(defense: Defense, served: Served) -> list[int]:
-    """How many words the dictionary may have in training."""
+    """How many words the dictionary may have in training, all (0) first and then the most."""
     if defense.truncated_by is None:
         return [0]
     setting = served.get(defense.truncated_by)
-    return [int(size) for size in setting.values] if isinstance(setting, OneOf) else [getattr(defense, defense.truncated_by)]
+    sizes = [int(size) for size in setting.values] if isinstance(setting, OneOf) else [getattr(defense, defense.truncated_by)]
+    return sorted(sizes, key=lambda size: (size > 0, -size))
 
 
 def check_quantisation(training: float, validation: float) -> None:

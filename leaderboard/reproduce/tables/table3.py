@@ -88,5 +88,8 @@ TABLE = Table(
     claims=claims,
     place=places.queried,
     ordered=MEASURE,
-    notes=(*places.NOTES, "The last row is ours, and no row of the paper: there, references are retrieved by the released words alone."),
+    notes=(
+        *places.NOTES,
+        "The last row is ours, and no row of the paper: there, references are retrieved by the released words alone.",
+    ),
 )
