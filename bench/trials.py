@@ -70,6 +70,11 @@ class Trials:
             trace = "".join(traceback.format_exception(error)) if isinstance(error, PluginError) else None
             return Made(record=record(cell, unit, status="failed", reason=str(error)), trace=trace)
 
+    def forget(self) -> None:
+        """Let go of the last unit's releases, which may be gigabytes, and would wait for the collector of cycles."""
+        self._observed.cache_clear()
+        self._shots.cache_clear()
+
     def rehearse(self) -> None:
         """Protect one keypoint of the first good image by each defense.
 

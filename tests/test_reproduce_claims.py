@@ -30,7 +30,7 @@ from leaderboard.reproduce.claims import (
 from leaderboard.reproduce.intervals import RESAMPLES, independent, interval, rank_correlation
 from leaderboard.reproduce.profiles import CPU, PROFILES, Materials, Setting
 from leaderboard.reproduce.study import printed
-from leaderboard.reproduce.tables import table4
+from leaderboard.reproduce.tables import table3, table4
 
 A, B = ("a", "ssim"), ("b", "ssim")
 SETTING = Setting(profile=CPU, materials=Materials(), extractor=Sift(), photographs=7)
@@ -245,3 +245,13 @@ def test_the_defenses_of_table_4_tell_the_truth_as_often_as_the_papers() -> None
         assert privacy.log10_true is not None
         assert 10**privacy.log10_true == pytest.approx(expected, rel=1e-4)
         assert privacy.epsilon == pytest.approx(epsilon - math.log(2))
+
+
+def test_the_trials_of_table_3_are_those_of_the_issue() -> None:
+    """10M, 1M, 100k and 10k of the paper's; of profile cpu as many as two cores can make."""
+    settings = {name: dataclasses.replace(SETTING, profile=profile) for name, profile in PROFILES.items()}
+    made = {name: {row.name: dataclasses.asdict(row.task)["trials"] for row in table3.rows(own)} for name, own in settings.items()}
+    assert [made["paper"][row] for row in table3.TRIALS] == [10_000_000, 1_000_000, 100_000, 10_000]
+    assert [made["cpu"][row] for row in table3.TRIALS] == [100_000, 30_000, 10_000, 3_000]
+    assert [made["smoke"][row] for row in table3.TRIALS] == [3_333, 1_000, 333, 100]
+    assert made["cpu"]["voc-match"] == 30_000

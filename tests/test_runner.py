@@ -1,9 +1,11 @@
 """The runner: determinism, resuming, and surviving what goes wrong."""
 
 import copy
+import gc
 import json
 import re
 import shutil
+import weakref
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -25,6 +27,7 @@ from bench.plugin import Asset, Attack, Defense, Task, View
 from bench.records import FILE, Record
 from bench.tasks.reconstruction import Reconstruction
 from bench.testing import small_dictionary
+from bench.trials import Trials
 from bench.types import Knowledge
 from defenses.affine import Affine
 from defenses.ldp import LDP
@@ -128,6 +131,20 @@ def test_release_depends_on_neither_attack_order_nor_company(images: Path, small
     assert whole == of(run([affine, ldp], [Guess(), Painter()], images))
     alone = run([affine], [Guess()], [images / "1.png"])
     assert [record["metrics"] for record in alone] == [whole["affine", "guess", "1.png"]]
+
+
+def test_releases_that_are_done_with_are_let_go_of_at_once(images: Path, small: Asset) -> None:
+    plan = runner.prepare([LDP(dictionary=small)], [Painter()], images, task=PAINT)
+    trials, (cell,), unit = Trials(plan), plan.cells, plan.units[0]
+    release = weakref.ref(trials.trial(cell, unit).shots[0].release)
+    gc.disable()
+    try:
+        assert release() is not None  # for the next attack on it
+        trials.forget()
+        assert release() is None
+    finally:
+        gc.enable()
+    assert trials.carry_out(cell, unit).record["status"] == "ok"
 
 
 def test_all_attacks_see_the_same_release(images: Path, small: Asset, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -88,7 +88,9 @@ class Here(Engine):
         trials: Trials | None = None
         for job in jobs:
             if trials is None or trials.plan is not job.plan:
-                trials = Trials(job.plan)  # and the last plan's releases are let go of
+                if trials is not None:
+                    trials.forget()
+                trials = Trials(job.plan)
             yield trials.carry_out(job.cell, job.unit)
 
 

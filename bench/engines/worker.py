@@ -12,6 +12,7 @@ from bench.engines import Letter
 from bench.errors import UserError
 from bench.trials import Made, Trials
 
+_LAST: list[Trials] = []  # whose last unit is kept
 PLANS = 2  # that are kept: jobs come plan by plan, but one that was lost may come late
 
 
@@ -25,6 +26,10 @@ def carry_out(letter: Letter) -> Made:
     """
     threads.limit(letter.threads)
     trials = _trials(letter.asked)
+    for last in _LAST:
+        if last is not trials:
+            last.forget()
+    _LAST[:] = [trials]
     run_hash, name = letter.key
     for cell in trials.plan.cells:
         if cell.head["run_hash"] == run_hash:

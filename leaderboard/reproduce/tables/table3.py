@@ -11,7 +11,7 @@ from dataclasses import replace
 from leaderboard.reproduce import places, published
 from leaderboard.reproduce.claims import Cell, Claim, falling, greater, same_order
 from leaderboard.reproduce.places import WITHIN
-from leaderboard.reproduce.profiles import Setting
+from leaderboard.reproduce.profiles import CPU, Setting
 from leaderboard.reproduce.study import Row, Table
 
 PRINTED = tuple(f"recall_{within}" for within in WITHIN)
@@ -52,14 +52,10 @@ def rows(setting: Setting) -> tuple[Row, ...]:
 
 
 def _trials(setting: Setting, variable: str) -> dict[str, int]:
+    """The paper's trials, or those that come to CPU_TRIALS at the share that profile cpu makes of the paper's."""
     if variable not in TRIALS:
         return {}
-    return {"trials": TRIALS[variable] if setting.profile.trials == 1 else scaled(CPU_TRIALS[variable], setting)}
-
-
-def scaled(trials: int, setting: Setting) -> int:
-    """The trials of profile cpu at this profile."""
-    return max(1, round(trials * setting.profile.trials / 0.003))
+    return {"trials": TRIALS[variable] if setting.profile.trials == 1 else round(CPU_TRIALS[variable] / CPU.trials)}
 
 
 def claims(paper: Mapping[Cell, float]) -> tuple[Claim, ...]:
