@@ -32,8 +32,8 @@ class Inlier(SelectiveAttack):
         if matcher is None:
             raise UnitError(f"nothing matches {type(view.release).__name__}")
         references = server.seen_in(view.release, view.defense, self.retrieved)
-        known, seed = server.dictionary(view.defense), int(rng.integers(2**31))
-        found = server.localize(view.release, known, references, matcher, self.trials, seed)
+        seed = int(rng.integers(2**31))
+        found = server.localize(view.release, view.defense, references, matcher, self.trials, seed)
         verified = np.zeros(len(found.correspondences), bool) if found.estimate is None else found.estimate.inliers
         keypoints = found.correspondences.keypoints[verified]
         seen = server.place.map.descriptors[found.correspondences.rows[verified]]

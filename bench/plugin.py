@@ -371,6 +371,7 @@ class Outcome:
 
     metrics: Mapping[str, float | None]
     image: Floats | None = None  # (H, W, 3) in [0, 1], where one was made
+    estimates: Mapping[str, Any] = field(default_factory=dict)  # what was found that is no measure of it, such as a pose; JSON
     notes: tuple[str, ...] = ()
     spared: float = 0.0  # seconds that it would have taken longer, had nothing been kept
 
@@ -380,6 +381,7 @@ class Task(Plugin, ABC):
 
     attacked: ClassVar[bool]  # whether it judges what an attack makes of the release, and not the release itself
     places: ClassVar[bool] = False  # whether it is about a place, even if none is named
+    mapped: ClassVar[bool] = False  # whether it asks for the place's map
 
     @abstractmethod
     def collection(self, images: Images, dataset: Dataset | None) -> Collection:

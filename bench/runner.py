@@ -75,7 +75,7 @@ class Plan:
     @property
     def needs_map(self) -> bool:
         """Whether some cell will ask for the place's map."""
-        return self.task.places or any(cell.attack is not None and Knowledge.MAP in cell.attack.needs for cell in self.cells)
+        return self.task.mapped or any(cell.attack is not None and Knowledge.MAP in cell.attack.needs for cell in self.cells)
 
     def __len__(self) -> int:
         """The number of its records."""

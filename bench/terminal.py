@@ -68,9 +68,9 @@ def add_seed(parser: argparse.ArgumentParser, what: str = "everything random") -
     parser.add_argument("--seed", type=whole, default=0, metavar="N", help=f"of {what} (default: %(default)s)")
 
 
-def add_extractor(parser: argparse.ArgumentParser) -> None:
-    """Declare --extractor."""
-    parser.add_argument("--extractor", metavar="SPEC", default="sift", help="what makes the features (default: %(default)s)")
+def add_extractor(parser: argparse.ArgumentParser, default: str | None = "sift", told: str = "sift") -> None:
+    """Declare --extractor; `told` names the default for people."""
+    parser.add_argument("--extractor", metavar="SPEC", default=default, help=f"what makes the features (default: {told})")
 
 
 def add_engine(parser: argparse.ArgumentParser) -> None:

@@ -205,16 +205,21 @@ def record(
     seconds: float | None = None,
 ) -> Record:
     """The record of a unit, or of all of them for None. `keypoints` are those of its image that has most."""
-    return cell.head | {
-        "unit": EVERY_UNIT if unit is None else unit.name,
-        "condition": None if unit is None else unit.condition,
-        "status": status,
-        "reason": reason,
-        "metrics": {} if outcome is None else {**outcome.metrics, "keypoints": keypoints},
-        "privacy": privacy(cell, keypoints),
-        "seconds": seconds,
-        "notes": [*notes, *(outcome.notes if outcome else ())],
-    }
+    found = {"estimates": dict(outcome.estimates)} if outcome is not None and outcome.estimates else {}
+    return (
+        cell.head
+        | found
+        | {
+            "unit": EVERY_UNIT if unit is None else unit.name,
+            "condition": None if unit is None else unit.condition,
+            "status": status,
+            "reason": reason,
+            "metrics": {} if outcome is None else {**outcome.metrics, "keypoints": keypoints},
+            "privacy": privacy(cell, keypoints),
+            "seconds": seconds,
+            "notes": [*notes, *(outcome.notes if outcome else ())],
+        }
+    )
 
 
 def privacy(cell: Cell, keypoints: int | None) -> dict[str, Any]:

@@ -16,7 +16,7 @@ import numpy as np
 from bench import registry
 from bench.listing import described
 from leaderboard.reproduce.intervals import Interval, interval, proportion
-from leaderboard.tables import PAPER
+from leaderboard.tables import MEDIANS, PAPER
 
 PRIVACY = "ssim"  # what attacks are compared by: how much of the photograph comes back
 # What a server can do, the first of these that was measured: its recall of localization, or else how well it matches.
@@ -68,12 +68,15 @@ def _summary(of: Measure, values: tuple[float | None, ...]) -> Interval | None:
 
 
 _OF_TASKS = (
-    Measure("translation_error", "translation error", -1, "median", "median over queries, in scene units; ∞ if not localized"),
-    Measure("rotation_error", "rotation error", -1, "median", "median over queries, in degrees; ∞ if not localized"),
+    *(
+        Measure(name, name.replace("_", " "), -1, "median", f"median over queries, in {unit}; ∞ if not localized")
+        for name, unit in zip(MEDIANS, ("scene units", "degrees"), strict=True)
+    ),
     Measure("precision", "precision", 1, "mean", "share of matches that are right"),
     Measure("recall", "recall", 1, "mean", "share of right matches that are found"),
-    Measure("registered_images", "registered images", 1, "mean", "images of the scene that structure from motion could place"),
-    Measure("sparse_points", "sparse points", 1, "mean", "points of the map"),
+    Measure("registered", "registered images", 1, "mean", "images of the scene that structure from motion could place"),
+    Measure("right_poses", "right poses", 1, "mean", "registered images within 5% of the place's extent and 5° of the truth"),
+    Measure("points", "sparse points", 1, "mean", "points of the map"),
     Measure("track_length", "track length", 1, "mean", "images that see a point of the map"),
     Measure("reprojection_error", "reprojection error", -1, "mean", "in pixels"),
 )

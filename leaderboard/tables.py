@@ -23,6 +23,8 @@ NOT_APPLICABLE = "n/a"
 # The metrics that come first, in this order; others follow by name.
 PAPER = ("mae", "mse", "ssim", "psnr")
 FIRST = ("keypoints", *PAPER)
+SHARES = "recall_"  # begins the names of metrics that a unit has 1 or 0 of
+MEDIANS = ("translation_error", "rotation_error")  # over all units: one without a value, which was not localized, is the worst
 SEEDED = "Releases are seeded: they are for measuring, and not private."
 COMPOSED = (
     "ε/image: the median over photographs of what their keypoints spend together, by the smaller of basic composition and the "
@@ -38,8 +40,8 @@ class Table:
     """A summary of records of one task, dataset and seed.
 
     `frame` has a row for each cell: defense, attack, photographs (done), failed, the mean of each metric over the photographs
-    that have it, epsilon_descriptor, epsilon_image (median), log10_true, note. What does not apply is missing, and `note`
-    says why.
+    that have it, or the median over all for `MEDIANS`, Wilson's interval of `SHARES`, epsilon_descriptor, epsilon_image
+    (median), log10_true, note. What does not apply is missing, and `note` says why.
     """
 
     heading: str
@@ -133,12 +135,26 @@ def rendered(table: Table) -> pd.DataFrame:
     if (frame["failed"] > 0).any():
         plain["failed"] = frame["failed"].map(_count)
     for name in table.metrics:
-        plain[name.upper() if name in PAPER else name] = frame[name].map(number)
+        plain[_heading(name)] = frame[name].map(number) + _ends(frame, name)
     plain["ε/descriptor"] = frame["epsilon_descriptor"].map(number)
     plain["ε/image"] = frame["epsilon_image"].map(number)
     plain["Pr(true)"] = frame["log10_true"].map(chance)
     plain["note"] = frame["note"]
     return plain
+
+
+def _ends(frame: pd.DataFrame, name: str) -> pd.Series | str:
+    """Of a share, in brackets behind it, its interval."""
+    if f"{name}_low" not in frame:
+        return ""
+    low, high = (frame[f"{name}_{end}"].map(number) for end in ("low", "high"))
+    return (" [" + low + ", " + high + "]").where(frame[name].notna(), "")
+
+
+def _heading(name: str) -> str:
+    if name in PAPER:
+        return name.upper()
+    return f"median {name}" if name in MEDIANS else name
 
 
 def explanations(table: Table) -> list[str]:
@@ -200,7 +216,11 @@ def _row(cell: list[Record], defense: str, attack: str, metrics: Sequence[str]) 
         "attack": attack,
         "photographs": None if cell[0]["status"] == "n/a" else len(done),
         "failed": None if cell[0]["status"] == "n/a" else len(cell) - len(done),
-        **{name: _mean(record["metrics"].get(name) for record in done) for name in metrics},
+        **{
+            column: value
+            for name in metrics
+            for column, value in _summary(name, [record["metrics"][name] for record in done if name in record["metrics"]]).items()
+        },
         "epsilon_descriptor": _float(privacy["epsilon_descriptor"]),
         "epsilon_image": _median(spent(record["privacy"]) for record in done),
         "log10_true": _float(privacy["log10_true"]),
@@ -286,6 +306,18 @@ def _mean(values: Iterable[float | str | None]) -> float:
 
 def _median(values: Iterable[float | str | None]) -> float:
     return float(_known(values).median())
+
+
+def _summary(name: str, values: list[float | None]) -> dict[str, float]:
+    """The columns of a metric: its average, and of a share of units the ends of its interval."""
+    if name in MEDIANS:
+        return {name: _median(math.inf if value is None else value for value in values)}
+    if not name.startswith(SHARES) or not values:
+        return {name: _mean(values)}
+    from leaderboard.reproduce.intervals import proportion  # which imports this file
+
+    share = proportion([value for value in values if value is not None])
+    return {name: share.mean, f"{name}_low": share.low, f"{name}_high": share.high}
 
 
 def _count(value: Any) -> str:

@@ -43,6 +43,10 @@ ELSEWHERE = {
     "reproduce table1": "test_reproduce.py, and .ci/run by the profile smoke",
     "reproduce table2": "test_reproduce.py, and .ci/run by the profile smoke",
     "audit --defense ldp:epsilon=2,subset_size=2 --words 64 --trials 1000000": "test_guarantee.py",
+    "run --task localization --defense none --dataset aachen:path=aachen/ --out runs/aachen": "test_localization.py",
+    "run --task localization:pairs=runs/aachen/pairs.txt --defense none --dataset aachen:path=aachen/ --out runs/pairs": (
+        "test_localization.py"
+    ),
     "run --defense my-defense --attack keypoints": "test_skeleton.py, with the package installed",
     "audit --defense ldp:epsilon=1/3,subset_size=1 --words 3 --trials 20000": "test_guarantee.py",
 }

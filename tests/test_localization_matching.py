@@ -1,6 +1,7 @@
 """Matchers against loops over all pairs."""
 
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from test_distances import residual, subspaces
 from bench.kernels.search import unit_rows
 from bench.localization import matching
 from bench.localization.maps import Map, from_arrays
-from bench.localization.matching import Matcher, MutualNN, PointToSubspace, Retrieved, Vocabulary
+from bench.localization.matching import Matcher, MutualNN, PointToSubspace, Retrieved, SubspaceToSubspace, Vocabulary
 from bench.plugin import Defense
 from bench.testing import example_features
 from bench.types import Descriptors, Indices, Release, Subspaces, WordSets
@@ -108,6 +109,29 @@ def test_point_to_subspace(seen: Map, retrieved: Retrieved, rng: np.random.Gener
     found = PointToSubspace(ratio=ratio).match(release, retrieved)
     assert pairs(found) == loops(apart, list(range(10)), retrieved, ratio)
     check_rows(found, retrieved)
+
+
+def test_subspace_to_subspace(seen: Map, retrieved: Retrieved, rng: np.random.Generator) -> None:
+    release, theirs = subspaces(rng, 10, 4), subspaces(rng, 70, 2)
+    apart = np.array(
+        [
+            [
+                residual(np.hstack([release.bases[n].T, theirs.bases[k].T]), theirs.origins[k] - release.origins[n])
+                for k in range(70)
+            ]
+            for n in range(10)
+        ]
+    )
+
+    def lifted(reference: int) -> Subspaces:
+        rows = seen.rows(reference)
+        return replace(theirs, keypoints=theirs.keypoints[rows], origins=theirs.origins[rows], bases=theirs.bases[rows])
+
+    found = SubspaceToSubspace().match(release, replace(retrieved, lifted=lifted))
+    assert pairs(found) == loops(apart, list(range(10)), retrieved, 1.0)
+    check_rows(found, retrieved)
+    with pytest.raises(TypeError, match="subspace-to-subspace needs a release of subspaces, and references that are lifted"):
+        SubspaceToSubspace().match(release, retrieved)
 
 
 def loops(apart: np.ndarray, owners: list[int], retrieved: Retrieved, ratio: float) -> list[tuple[int, int]]:

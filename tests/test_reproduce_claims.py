@@ -11,7 +11,9 @@ import pytest
 from scipy import stats
 
 from bench.features.sift import Sift
+from bench.kernels.subset import log10_chance
 from bench.public import Public
+from defenses.ldp import LDP
 from leaderboard.reproduce import scale, tables
 from leaderboard.reproduce.claims import (
     FEWEST,
@@ -191,6 +193,31 @@ def test_the_paper_keeps_its_own_claims(name: str) -> None:
         alike = pd.DataFrame({cell: [sign * value] * FEWEST for cell, value in values.items()})
         wrong = [finding.claim.text for finding in judge(claims, alike, values, {}) if finding.verdict is not expected]
         assert wrong == [text for text in wrong if sign == -1 and ("flat" in text or "equals" in text)]
+
+
+def test_claims_about_structure_fail_where_they_should() -> None:
+    """Had m = 4 the points of m = 32, and quantised descriptors more than raw ones, those two claims would fall, and no other."""
+    rows = tables.everything()["tableS2"].rows(SETTING)
+    paper = printed(rows)
+    wrong = dict(paper)
+    wrong["m 4", "points"], wrong["m 32", "points"] = paper["m 32", "points"], paper["m 4", "points"]
+    wrong["no privacy", "points"] = 1.1 * paper["raw", "points"]
+    _, *claims = tables.everything()["tableS2"].claims(paper)  # the first is about every pair
+    alike = pd.DataFrame({cell: [value] * FEWEST for cell, value in wrong.items()})
+    failed = [finding.claim.text for finding in judge(claims, alike, paper, {}) if finding.verdict is not Verdict.HOLDS]
+    assert [text.partition(":")[0] for text in failed] == [
+        "Quantisation alone, without privacy, loses points.",
+        "An interior m is near best",
+    ]
+
+
+def test_structure_s_dictionaries_tell_the_truth_as_often_as_the_papers() -> None:
+    for row in tables.everything()["tableS2"].rows(SETTING)[2:]:
+        defense = row.defense
+        assert isinstance(defense, LDP)
+        ours = log10_chance(defense.epsilon, defense.words, defense.subset_size)
+        assert ours == pytest.approx(log10_chance(10, 512_000, int(row.labels["m"])), abs=1e-4)
+        assert defense.epsilon == pytest.approx(10 - math.log(2))
 
 
 # ---- the scale

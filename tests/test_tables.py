@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from rich.console import Console
+from scipy import stats
 
 from leaderboard import figures, tables
 
@@ -47,6 +48,33 @@ def test_metrics_are_averaged_over_photographs() -> None:
     assert row["psnr"] == 20.0  # of the photographs that have one
     assert row["epsilon_image"] == 2000.0
     assert table.metrics == ("keypoints", "mae", "ssim", "psnr")  # nothing has an angle
+
+
+def localized(unit: str, recall: float, error: float | None) -> dict[str, Any]:
+    metrics = {"recall_0.25m_2deg": recall, "translation_error": error}
+    return record(unit, task="localization", attack=None, metrics=metrics)
+
+
+def test_a_query_that_was_not_localized_is_the_worst_of_the_median() -> None:
+    """Negative control: averaged over those that survived, the error would be 0.2."""
+    queries = [localized("a", 1.0, 0.1), localized("b", 1.0, 0.3), localized("c", 0.0, None), localized("d", 0.0, None)]
+    (half,) = tables.tables(queries)
+    (most,) = tables.tables([*queries, localized("e", 1.0, 0.2)])
+    assert half.frame.iloc[0]["translation_error"] == math.inf
+    assert most.frame.iloc[0]["translation_error"] == pytest.approx(0.3)
+    assert "| median translation_error |" in tables.to_markdown(half)
+    assert "| ∞ |" in tables.to_markdown(half)
+
+
+def test_shares_have_wilson_s_interval() -> None:
+    (table,) = tables.tables(
+        [localized(str(number), float(number < 7), 0.1) for number in range(10)] + [NA | {"task": "localization"}]
+    )
+    expected = stats.binomtest(7, 10).proportion_ci(0.95, "wilson")
+    row = table.frame.iloc[0]
+    assert (row["recall_0.25m_2deg_low"], row["recall_0.25m_2deg_high"]) == pytest.approx((expected.low, expected.high))
+    shown = tables.rendered(table)["recall_0.25m_2deg"]
+    assert list(shown) == [f"0.7 [{expected.low:.4g}, {expected.high:.4g}]", "n/a"]
 
 
 def test_the_smaller_of_two_compositions_is_shown() -> None:

@@ -14,17 +14,18 @@ examples:
   bench reproduce table1
   bench reproduce table4 --images DIR --out runs/test
   bench reproduce figures --profile smoke
+  bench reproduce tableS2 --dataset captured:path=DIR,leading=25
 """
 REQUIRED = ("what",)
 
 
 def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("what", nargs="?", metavar="NAME", help="table1, table4, tableS3, tableS4, figures, ...")
+    parser.add_argument("what", nargs="?", metavar="NAME", help="table1, table2, tableS2, figures, ...")
     parser.add_argument("--profile", metavar="NAME", default="cpu", help="smoke, cpu or paper: the sizes (default: %(default)s)")
     parser.add_argument("--images", type=Path, metavar="DIR", help="a folder of photographs (default: the built-in ones)")
-    parser.add_argument("--dataset", metavar="SPEC", help="the place that tables of localization are about (default: a gallery)")
+    parser.add_argument("--dataset", metavar="SPEC", help="the place that a table is about (default: a gallery)")
     parser.add_argument("--workers", type=whole, metavar="N", help="processes, for such tables (default: one a core)")
-    add_extractor(parser)
+    add_extractor(parser, None, "the table's own")
     add_seed(parser)
     parser.add_argument(
         "--out", type=Path, metavar="DIR", help="folder for the results; resumed if it exists (default: in runs/)"
@@ -48,7 +49,7 @@ def execute(args: argparse.Namespace) -> int:
         args.profile,
         images=args.images,
         dataset=None if args.dataset is None else spec.read(args.dataset, registry.DATASET),
-        extractor=spec.read(args.extractor, registry.EXTRACTOR),
+        extractor=None if args.extractor is None else spec.read(args.extractor, registry.EXTRACTOR),
         seed=args.seed,
         out=args.out,
         workers=args.workers,

@@ -55,7 +55,7 @@ def options(parser: argparse.ArgumentParser) -> None:
 def execute(args: argparse.Namespace) -> int:
     from bench import engines, registry, runner, spec, watching
     from bench.runner import Asked
-    from leaderboard import report
+    from leaderboard import localized, report
 
     engine = engines.choose(args.workers, args.engine, args.scheduler)
     task = spec.read(args.task, registry.TASK)
@@ -76,6 +76,8 @@ def execute(args: argparse.Namespace) -> int:
     records = watching.watched([plan], out, engine, f"{task.name()}: {len(plan.units)} units, {len(plan.cells)} pairs")
     report.write(records, plan.units, out)
     _print_records(records) if args.json else watching.print_tables(records)
+    for line in localized.write(records, out):
+        say(DONE, line)
     say(DONE, f"written to {out}")
     return FAILED if any(record["status"] == "failed" for record in records) else DONE
 

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from bench.device import pick_device
-from bench.kernels.distances import mutual, points_to_points, subspaces_to_points
+from bench.kernels.distances import mutual, points_to_points, subspaces_to_points, subspaces_to_subspaces
 from bench.localization.maps import Map
 from bench.plugin import Defense
 from bench.types import Descriptors, Indices, Release, Subspaces, WordSets
@@ -31,6 +31,7 @@ class Retrieved:
     map: Map
     references: Indices  # (V',)
     words: Indices | None = None  # (T,) what all of the map's keypoints quantise to in the dictionary of the release
+    lifted: Callable[[int], Subspaces] | None = None  # the keypoints of a reference, lifted as those of the release were
 
     @property
     def rows(self) -> Indices:
@@ -100,7 +101,7 @@ class MutualNN(Matcher):
             raise TypeError(f"mutual-nn matches descriptors, not {type(release).__name__}")
         sets = release.descriptors[:, None] if isinstance(release, Descriptors) else release.candidates  # (N, m, D)
         mine = torch.from_numpy(sets.reshape(-1, sets.shape[2])).to(pick_device())
-        rows, seen = _nearest(retrieved, lambda theirs: points_to_points(mine, theirs), self.ratio)
+        rows, seen = _nearest(retrieved, lambda reference: points_to_points(mine, _points(retrieved, reference)), self.ratio)
         return distinct(rows // sets.shape[1], seen, retrieved.map)
 
 
@@ -125,7 +126,26 @@ class PointToSubspace(Matcher):
     def match(self, release: Release, retrieved: Retrieved) -> Correspondences:
         if not isinstance(release, Subspaces):
             raise TypeError(f"point-to-subspace matches subspaces, not {type(release).__name__}")
-        return distinct(*_nearest(retrieved, lambda theirs: subspaces_to_points(release, theirs), self.ratio), retrieved.map)
+        found = _nearest(retrieved, lambda reference: subspaces_to_points(release, _points(retrieved, reference)), self.ratio)
+        return distinct(*found, retrieved.map)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SubspaceToSubspace(Matcher):
+    """Mutually nearest by the distance of two subspaces, where references are lifted, too (Dusmanu et al., CVPR 2021).
+
+    It serves worse than `PointToSubspace`, and is for servers that hold no descriptors either.
+    """
+
+    accepts = (Subspaces,)
+
+    ratio: float = 1.0
+
+    def match(self, release: Release, retrieved: Retrieved) -> Correspondences:
+        if not isinstance(release, Subspaces) or (lifted := retrieved.lifted) is None:
+            raise TypeError("subspace-to-subspace needs a release of subspaces, and references that are lifted")
+        found = _nearest(retrieved, lambda reference: subspaces_to_subspaces(release, lifted(reference)), self.ratio)
+        return distinct(*found, retrieved.map)
 
 
 MATCHERS: dict[str, type[Matcher]] = {
@@ -133,6 +153,7 @@ MATCHERS: dict[str, type[Matcher]] = {
     "noisy-nn": NoisyNN,
     "mutual-nn": MutualNN,
     "point-to-subspace": PointToSubspace,
+    "subspace-to-subspace": SubspaceToSubspace,
 }
 
 
@@ -162,15 +183,19 @@ def distinct(keypoints: Indices, rows: Indices, seen: Map) -> Correspondences:
     return Correspondences(keypoints=pairs[:, 0], points=pairs[:, 1], rows=rows[first])
 
 
-def _nearest(retrieved: Retrieved, squared: Callable[[Tensor], Tensor], ratio: float) -> tuple[Indices, Indices]:
+def _points(retrieved: Retrieved, reference: int) -> Tensor:
+    """The descriptors of a reference. -> (R, D)"""
+    return torch.from_numpy(retrieved.map.descriptors[retrieved.map.rows(reference)]).to(pick_device())
+
+
+def _nearest(retrieved: Retrieved, squared: Callable[[int], Tensor], ratio: float) -> tuple[Indices, Indices]:
     """Mutually nearest pairs of something released and a keypoint of a reference, one reference after the other.
 
-    `squared` takes a reference's descriptors (R, D) to squared distances (n, R). -> (P,) rows of those, (P,) rows of the map
+    `squared` takes a reference of R keypoints to squared distances (n, R). -> (P,) rows of those, (P,) rows of the map
     """
     released, seen = [np.empty(0, dtype=np.int64)], [np.empty(0, dtype=np.int64)]
     for reference in retrieved.references.tolist():
-        part = retrieved.map.rows(reference)
-        rows, columns = mutual(squared(torch.from_numpy(retrieved.map.descriptors[part]).to(pick_device())), ratio)
+        rows, columns = mutual(squared(reference), ratio)
         released.append(rows)
-        seen.append(part.start + columns)
+        seen.append(retrieved.map.rows(reference).start + columns)
     return np.concatenate(released), np.concatenate(seen)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pycolmap
 
+from bench import spec
 from bench.features.dictionary import Dictionary
 from bench.kernels.subspaces import guesses
 from bench.localization import matching, pose
@@ -16,6 +17,7 @@ from bench.localization.retrieval import TOP
 from bench.place import Place
 from bench.plugin import Defense
 from bench.public import REFERENCES, Public
+from bench.randomness import randomness
 from bench.types import Bytes, Descriptors, Features, Floats, Indices, Release, Subspaces, WordSets
 
 VOCABULARY = 16_000  # words that retrieval by descriptors uses, if the references have four times as many
@@ -63,19 +65,25 @@ class Server:
         return self._alike(looks(release), count)
 
     def localize(
-        self, release: Release, known: Dictionary | None, references: Indices, matcher: str, trials: int, seed: int
+        self, release: Release, defense: Defense | None, references: Indices, matcher: str, trials: int, seed: int
     ) -> Localized:
         """Match a release with references, and estimate the pose of its camera.
 
         Parameters
         ----------
-        known : the dictionary of the release, for matchers of words
+        defense : that the release is from, for matchers of words or of references that are lifted as well
         matcher : one of matching.MATCHERS that applies to the release
         trials : of RANSAC, at most
         """
         how = matching.MATCHERS[matcher]()
-        words = self.place.words(known) if how.by_words and known is not None else None
-        found = how.match(release, Retrieved(map=self.place.map, references=references, words=words))
+        known = self.dictionary(defense) if how.by_words and defense is not None else None
+        retrieved = Retrieved(
+            map=self.place.map,
+            references=references,
+            words=None if known is None else self.place.words(known),
+            lifted=None if defense is None else lambda reference: self._lifted(defense, reference),
+        )
+        found = how.match(release, retrieved)
         estimate = pose.estimate(*self._pairs(release, found), self.camera, trials=trials, seed=seed)
         return Localized(correspondences=found, estimate=estimate)
 
@@ -86,6 +94,14 @@ class Server:
         if found.estimate is None:
             return None
         return pose.misfit(*self._pairs(raw, found.correspondences), self.camera, found.estimate)
+
+    def _lifted(self, defense: Defense, reference: int) -> Subspaces:
+        """The keypoints of a reference as that defense releases them: once and for all, whatever the client's seed."""
+        rng = randomness("lifted reference", self.place.digest, reference, spec.configuration(defense, self.public))
+        lifted = defense.protect(self.place.references[reference], self.public, rng)
+        if not isinstance(lifted, Subspaces):
+            raise TypeError(f"{defense.name()} lifts nothing")
+        return lifted
 
     def _pairs(self, release: Release, found: Correspondences) -> tuple[np.ndarray, np.ndarray]:
         """Pixels and points. -> (C, 2), (C, 3) float64"""

@@ -14,6 +14,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from bench import units
+from bench.datasets import lists
 from bench.datasets.gallery import Gallery
 from bench.datasets.scene import SceneImage
 from bench.errors import UnitError, UserError
@@ -38,9 +39,10 @@ class Localization(Task):
 
     attacked: ClassVar[bool] = False
     places: ClassVar[bool] = True
+    mapped: ClassVar[bool] = True
 
-    # auto: what serves the release best
-    matcher: Literal["auto", "vocabulary", "noisy-nn", "mutual-nn", "point-to-subspace"] = "auto"
+    # auto: what serves the release best, where references are not lifted
+    matcher: Literal["auto", "vocabulary", "noisy-nn", "mutual-nn", "point-to-subspace", "subspace-to-subspace"] = "auto"
     retrieval: Literal["raw", "released"] = "raw"
     retrieved: int = 20  # references of a query
     trials: int = 30_000  # of RANSAC, at most
@@ -53,10 +55,7 @@ class Localization(Task):
     def collection(self, images: Images, dataset: Dataset | None) -> Collection:
         if images is not None:
             raise UserError("localization is about the queries of a dataset and takes no images; give --dataset")
-        collection = units.of_queries(dataset or Gallery())
-        if all(unit.subject.cam_from_world is None for unit in collection.units):
-            raise UserError(f"{collection.name}: the poses of its queries are withheld; nothing could be measured")
-        return collection
+        return units.of_queries(dataset or Gallery())
 
     def inapplicable(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> str | None:
         name = self._matcher(defense)
@@ -73,17 +72,21 @@ class Localization(Task):
         if matcher is None:
             raise UnitError(f"nothing matches {type(trial.release).__name__}")
         references, seed = self._retrieved(server, trial, query), int(trial.rng.integers(2**31))
-        known = server.dictionary(trial.defense)
-        found = server.localize(trial.release, known, references, matcher, self.trials, seed)
+        found = server.localize(trial.release, trial.defense, references, matcher, self.trials, seed)
         told = {
             "matches": float(len(found.correspondences)),
             "inliers": 0.0 if found.estimate is None else float(found.estimate.inliers.sum()),
             "trials": 0.0 if found.estimate is None else float(found.estimate.trials),
         }
+        there = None if found.estimate is None else found.estimate.cam_from_world
+        estimates = {
+            "pose": None if there is None else [*lists.quaternion(there).tolist(), *there.translation.tolist()],
+            "retrieved": [server.place.map.names[reference] for reference in references],
+        }
         if query.cam_from_world is None:
-            return Outcome(metrics=told, notes=("its pose is withheld",))
-        errors = None if found.estimate is None else pose.errors(found.estimate.cam_from_world, query.cam_from_world)
-        return Outcome(metrics={**within(errors), **told})
+            return Outcome(metrics=told, estimates=estimates, notes=("its pose is withheld",))
+        errors = None if there is None else pose.errors(there, query.cam_from_world)
+        return Outcome(metrics={**within(errors), **told}, estimates=estimates)
 
     def _matcher(self, defense: Defense) -> str | None:
         return matching.default(defense) if self.matcher == "auto" else self.matcher

@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.text import Text
 
 from bench import engines, threads
 from bench.engines import Engine
 from bench.errors import UserError, unknown
+from bench.features.sift import Sift
 from bench.plugin import Asset, Dataset, Extractor
+from leaderboard import localized
 from leaderboard.reproduce import figures, report, run, tables
 from leaderboard.reproduce.drawing import Drawing, Scene, save
 from leaderboard.reproduce.profiles import Materials, Setting, profile
 from leaderboard.reproduce.run import Judged
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 FIGURES = "figures"
 
@@ -36,7 +42,7 @@ def reproduce(
     *,
     images: Path | None,
     dataset: Dataset | None,
-    extractor: Extractor,
+    extractor: Extractor | None,
     seed: int,
     out: Path | None,
     workers: int | None,
@@ -54,30 +60,34 @@ def reproduce(
     known, drawings = tables.everything(), drawn_by()
     if name not in {**known, **drawings}:
         raise unknown("table", name, [*known, *drawings])
-    sizes = profile(size)
+    sizes, table = profile(size), known.get(name)
     of_place = name in of_places()
     if of_place and images is not None:
         raise UserError(f"{name} is about a place: name it with --dataset, and give no --images")
     if not of_place and dataset is not None:
         raise UserError(f"{name} is about photographs: name them with --images, and give no --dataset")
     if of_place:
-        judged = run.queries(dataset or (sizes.place if name in known else sizes.pictured))
+        judged = run.queries(dataset or (table.place(sizes) if table and table.place else sizes.pictured))
     else:
         judged = run.choose(images, sizes, sizes.pictures if name == FIGURES else sizes.photographs)
     setting = Setting(
         profile=sizes,
         materials=Materials(**{field: Asset(file) for field, file in materials.items()}),
-        extractor=extractor,
+        extractor=extractor or (table.extractor(sizes) if table else Sift()),
         photographs=len(judged.chosen),
         seed=seed,
     )
     folder = out or Path("runs") / f"reproduce-{sizes.name}-{_named(images, judged)}"
     engine = engines.choose(workers or (threads.cores() if of_place else 1))
-    if name in drawings:
+    if table is None:
         return _figures(name, drawings[name], setting, judged, folder, engine)
-    rebuilt = run.rebuild(known[name], setting, judged, folder, engine)
+    rebuilt = run.rebuild(table, setting, judged, folder, engine)
     report.write(rebuilt, folder)
-    return Done(out=folder, shown=tuple(report.to_rich(rebuilt)), failed=run.failures(rebuilt.ran))
+    scene = Scene(setting=setting, judged=judged, ran=rebuilt.ran, out=folder)
+    every = (record for records in rebuilt.ran.records.values() for record in records)
+    files = [Text(line) for line in localized.write(every, folder)]
+    files += [] if table.draw is None else _drawn(name, table.draw(scene), folder)
+    return Done(out=folder, shown=(*report.to_rich(rebuilt), *files), failed=run.failures(rebuilt.ran))
 
 
 def drawn_by() -> dict[str, tuple[Drawing, ...]]:
@@ -90,7 +100,7 @@ def drawn_by() -> dict[str, tuple[Drawing, ...]]:
 def of_places() -> set[str]:
     """What of the command is about the queries of a place."""
     drawings = {name for name, drawn in drawn_by().items() if any(drawing.place for drawing in drawn)}
-    return drawings | {name for name, table in tables.everything().items() if table.place}
+    return drawings | {name for name, table in tables.everything().items() if table.place is not None}
 
 
 def _named(images: Path | None, judged: Judged) -> str:
@@ -104,12 +114,14 @@ def _figures(name: str, drawings: tuple[Drawing, ...], setting: Setting, judged:
     rows = {row.name: row for drawing in drawings for row in drawing.rows(setting)}
     ran = run.execute(list(rows.values()), setting, judged, out, name, engine)
     scene = Scene(setting=setting, judged=judged, ran=ran, out=out)
-    shown = []
-    for drawing in drawings:
-        for kind, figure in drawing.draw(scene):
-            files = save(figure, out / FIGURES / f"{drawing.name}-{kind}".removesuffix("-").replace("/", "-"))
-            shown += [Text(str(file)) for file in files]
+    shown = [file for drawing in drawings for file in _drawn(drawing.name, drawing.draw(scene), out)]
     return Done(out=out, shown=tuple(shown), failed=run.failures(ran))
+
+
+def _drawn(name: str, drawn: Iterator[tuple[str, Figure]], out: Path) -> list[Text]:
+    """Save figures in `out`/figures. -> the paths of their files"""
+    stems = ((out / FIGURES / f"{name}-{kind}".removesuffix("-").replace("/", "-"), figure) for kind, figure in drawn)
+    return [Text(str(file)) for stem, figure in stems for file in save(figure, stem)]
 
 
 def materials() -> tuple[str, ...]:

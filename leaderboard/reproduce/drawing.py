@@ -44,15 +44,15 @@ class Scene:
             with contextlib.suppress(UnitError):
                 yield unit.name, units.read(unit.images[0])[0]
 
-    def panel(self, row: str, unit: str, title: str = "", shown: Mapping[str, str] = SSIM) -> Panel:
-        """The reconstruction of a unit in a row of a table, with metrics beneath, by label; or why there is none."""
+    def panel(self, row: str, unit: str, title: str = "", shown: Mapping[str, str] = SSIM, digits: int = 3) -> Panel:
+        """The picture made of a unit in a row of a table, with metrics beneath, by label; or why there is none."""
         for record in of(self.ran, row):
             if record["status"] == "n/a":
                 return Panel(None, title, "n/a")
             if record["unit"] == unit:
                 path = picture(self.out, record)
                 scores = {label: record["metrics"].get(metric) for label, metric in shown.items()}
-                told = ", ".join(f"{label} {score:.3f}" for label, score in scores.items() if score is not None)
+                told = ", ".join(f"{label} {score:.{digits}f}" for label, score in scores.items() if score is not None)
                 return Panel(np.asarray(Image.open(path)) if path.is_file() else None, title, told or record["status"])
         return Panel(None, title, "not run")
 

@@ -11,10 +11,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from bench import registry
-from bench.plugin import Asset, Defense, Task
+from bench.plugin import Asset, Dataset, Defense, Task
 from bench.public import REFERENCES
 from leaderboard.reproduce import scale
-from leaderboard.reproduce.profiles import Setting
+from leaderboard.reproduce.profiles import Profile, Setting
 from leaderboard.reproduce.study import Measure, Row, build
 
 FULL = "2^1024"  # |K| of all descriptors
@@ -29,35 +29,44 @@ NOTES = (
 )
 
 
+def queried(profile: Profile) -> Dataset:
+    """Whose queries the tables are about, unless another place is named."""
+    return profile.place
+
+
 def task(setting: Setting, trials: int = TRIALS, **given: Any) -> Task:
     """Localization with that many of the paper's trials."""
     return build(registry.TASK, "localization", {"trials": max(1, round(trials * setting.profile.trials)), **given})
 
 
-def defense(setting: Setting, size: str, epsilon: str, subset: int, dictionary: str = REFERENCES) -> Defense:
-    """What the paper's |K|, ε and m are here."""
+def defense(
+    setting: Setting, size: str, epsilon: str, subset: int, dictionary: str = REFERENCES, factor: float | None = None
+) -> Defense:
+    """What the paper's |K|, ε and m are here; |K| is scaled by `factor`, the profile's for localization if None."""
     if size == FULL:
         if math.isinf(float(epsilon)):
             return build(registry.DEFENSE, "none", {})
         shifted = float(epsilon)  # nothing to scale
         return build(registry.DEFENSE, "naive-ldp", {"epsilon": shifted, "subset_size": subset})
-    words = scale.words(int(size), setting.profile.place_scale)
-    shifted = scale.epsilon(float(epsilon), setting.profile.place_scale)
+    words, shifted = scaled(setting, size, epsilon, factor)
     given = {"epsilon": shifted, "subset_size": subset, "words": words, "dictionary": Asset(dictionary)}
     return build(registry.DEFENSE, "ldp", given)
 
 
-def labels(setting: Setting, size: str, epsilon: str, subset: int) -> dict[str, str]:
+def labels(setting: Setting, size: str, epsilon: str, subset: int, factor: float | None = None) -> dict[str, str]:
     """Of a row, for people: the paper's and ours."""
     if size == FULL:
         ours = {"our |K|": "all", "our ε": epsilon}
     else:
-        words, shifted = (
-            scale.words(int(size), setting.profile.place_scale),
-            scale.epsilon(float(epsilon), setting.profile.place_scale),
-        )
+        words, shifted = scaled(setting, size, epsilon, factor)
         ours = {"our |K|": f"{words:,}", "our ε": "inf" if math.isinf(shifted) else f"{shifted:.4g}"}
     return {"|K|": size if size == FULL else f"{int(size):,}", "ε": epsilon, "m": str(subset), **ours}
+
+
+def scaled(setting: Setting, size: str, epsilon: str, factor: float | None = None) -> tuple[int, float]:
+    """Our |K| and ε for the paper's."""
+    by = setting.profile.place_scale if factor is None else factor
+    return scale.words(int(size), by), scale.epsilon(float(epsilon), by)
 
 
 def name(size: str, epsilon: str, subset: int) -> str:
@@ -89,5 +98,9 @@ def measures(**conditions: str | None) -> dict[str, Measure]:
 
 
 def told(condition: str | None = None) -> dict[str, Measure]:
-    """What RANSAC had to do with, means over queries."""
-    return {name: Measure(metric=name, digits=0, condition=condition) for name in ("matches", "inliers", "trials")}
+    """Median errors, in the place's unit of length and degrees, and what RANSAC had to do with, means over queries."""
+    errors = {
+        f"median_{name}": Measure(metric=name, digits=2, condition=condition, median=True)
+        for name in ("translation_error", "rotation_error")
+    }
+    return errors | {name: Measure(metric=name, digits=0, condition=condition) for name in ("matches", "inliers", "trials")}

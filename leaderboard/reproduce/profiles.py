@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from bench.datasets.gallery import Gallery
+from bench.datasets.walk import Walk
 from bench.errors import unknown
 from bench.plugin import Asset, Extractor
 
@@ -25,6 +26,10 @@ class Profile:
     place: Gallery  # that tables of localization are about, unless another is named
     place_scale: float  # as `scale`, for such a table
     trials: float  # of RANSAC, as a share of the paper's
+    walk: Walk  # that the table of structure from motion is about, unless another place is named
+    walk_scale: float  # as `scale`, for that table
+    walk_keypoints: int  # of an image, at most, for that table
+    seeds: int  # that it is done with
     # Fields of attacks that are set for want of time, where an attack has them; otherwise attacks are as they were tuned.
     reduced: Mapping[str, int] = field(default_factory=dict)
 
@@ -46,6 +51,10 @@ SMOKE = Profile(
     place=Gallery(views=12, queries=6, width=320, height=240, rooms=1, detail=0.5),
     place_scale=1 / 512,
     trials=1 / 10_000,
+    walk=Walk(views=4, others=8, steps=60, width=320, height=240, detail=0.3),
+    walk_scale=1 / 256,
+    walk_keypoints=1000,
+    seeds=1,
     reduced={"others": 8},
 )
 CPU = Profile(
@@ -59,6 +68,10 @@ CPU = Profile(
     place=Gallery(),
     place_scale=1 / 32,
     trials=0.003,
+    walk=Walk(),
+    walk_scale=1 / 2,
+    walk_keypoints=2000,
+    seeds=6,
 )
 PAPER = Profile(
     name="paper",
@@ -71,6 +84,10 @@ PAPER = Profile(
     place=Gallery(),
     place_scale=1.0,
     trials=1.0,
+    walk=Walk(views=128, others=212),
+    walk_scale=1.0,
+    walk_keypoints=8192,
+    seeds=6,
 )
 PROFILES = {profile.name: profile for profile in (SMOKE, CPU, PAPER)}
 

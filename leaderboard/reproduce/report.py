@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
 from bench import spec
+from leaderboard.reproduce import run
 from leaderboard.reproduce.claims import Evidence, Finding, Verdict
 from leaderboard.reproduce.intervals import LEVEL, Interval
 from leaderboard.reproduce.run import Rebuilt
@@ -25,8 +26,8 @@ DIGITS = 4  # of the numbers that speak for a verdict
 SHORT = 12  # statements of a claim that are all written out; of more, those that do not hold or cannot be told
 MOST = 12  # of these that a terminal shows
 INTERVALS = (
-    f"In brackets: {LEVEL:.0%}, by percentile bootstrap over photographs or queries, of shares Wilson's; a verdict rests on the "
-    "bootstrap of the paired combination."
+    f"In brackets: {LEVEL:.0%}, by percentile bootstrap over photographs, queries or seeds, of shares Wilson's; a verdict rests "
+    "on the bootstrap of the paired combination."
 )
 
 
@@ -55,10 +56,9 @@ def heading(rebuilt: Rebuilt) -> str:
     judged, setting = rebuilt.judged, rebuilt.setting
     count, features = len(judged.names), extractor_label(spec.written(setting.extractor))
     of_all = "" if count == judged.available else f" of {judged.available}"
-    return (
-        f"{rebuilt.table.title}; profile {setting.profile.name}, {count}{of_all} {judged.name}, {features} features, "
-        f"seed {setting.seed}"
-    )
+    first, *others = run.seeds(rebuilt.table, setting)
+    seeds = f"seeds {first} to {others[-1]}" if others else f"seed {first}"
+    return f"{rebuilt.table.title}; profile {setting.profile.name}, {count}{of_all} {judged.name}, {features} features, {seeds}"
 
 
 def markdown(rebuilt: Rebuilt) -> str:
@@ -110,7 +110,8 @@ def to_rich(rebuilt: Rebuilt) -> Iterator[RichTable]:
 
 def side_by_side(rebuilt: Rebuilt) -> pd.DataFrame:
     """Paper and ours as text, a row for each row; those borrowed from other tables come last."""
-    rows = [_shown(row, rebuilt) for row in rebuilt.ran.rows]
+    printed = {measure for row in rebuilt.ran.rows for measure in row.paper}
+    rows = [_shown(row, rebuilt, printed) for row in rebuilt.ran.rows]
     frame = pd.DataFrame(rows).fillna("")
     frame["note"] = [rebuilt.notes[row.name] for row in rebuilt.ran.rows]
     return frame if frame["note"].any() else frame.drop(columns="note")
@@ -126,7 +127,7 @@ def numbers(rebuilt: Rebuilt) -> pd.DataFrame:
                 "measure": measure,
                 "paper": row.paper.get(measure),
                 **_fields(rebuilt.ours.get((row.name, measure))),
-                "cell_id": rebuilt.ran.cells[row.name],
+                "cell_id": " ".join(rebuilt.ran.cells[row.name]),
                 "note": rebuilt.notes[row.name],
             }
             for row in rebuilt.ran.rows
@@ -157,7 +158,7 @@ def plain(rebuilt: Rebuilt) -> dict[str, Any]:
         "units": {"of": rebuilt.judged.name, "names": list(rebuilt.judged.names), "available": rebuilt.judged.available},
         "dataset": None if rebuilt.judged.dataset is None else spec.written(rebuilt.judged.dataset),
         "extractor": spec.written(setting.extractor),
-        "seed": setting.seed,
+        "seeds": list(run.seeds(rebuilt.table, setting)),
         "rows": [_row(row, rebuilt) for row in rebuilt.ran.rows],
         "spearman": None if rebuilt.correlation is None or math.isnan(rebuilt.correlation) else rebuilt.correlation,
         "claims": [
@@ -206,14 +207,15 @@ def _sentence(evidence: Evidence) -> str:
     return f"{evidence.verdict.value}: {evidence.statement.text}: {paper}{ours}{reason}"
 
 
-def _shown(row: Row, rebuilt: Rebuilt) -> dict[str, str]:
+def _shown(row: Row, rebuilt: Rebuilt, printed: Container[str]) -> dict[str, str]:
+    """`printed` are the measures that the paper has of some row."""
     cells: dict[str, str] = dict(row.labels)
     counts = set()
     for measure, wanted in rebuilt.table.measures.items():
         ours = rebuilt.ours.get((row.name, measure))
         if measure in row.paper:
             cells[f"{measure}, paper"] = f"{row.paper[measure]:.{wanted.digits}f}"
-        cells[f"{measure}, ours" if measure in row.paper else measure] = (
+        cells[f"{measure}, ours" if measure in printed else measure] = (
             "n/a" if ours is None else _written(ours, wanted.digits, "f")
         )
         counts |= set() if ours is None else {ours.count}
@@ -221,8 +223,10 @@ def _shown(row: Row, rebuilt: Rebuilt) -> dict[str, str]:
 
 
 def _written(value: Interval, digits: int, style: str) -> str:
-    mean, low, high = (f"{number:.{digits}{style}}" for number in (value.mean, value.low, value.high))
-    return mean if value.count == 1 else f"{mean} [{low}, {high}]"
+    mean, low, high = (
+        "∞" if math.isinf(number) else f"{number:.{digits}{style}}" for number in (value.mean, value.low, value.high)
+    )
+    return mean if math.isinf(value.low) else f"{mean} [{low}, {high}]"  # of one unit alone, or a median
 
 
 def _row(row: Row, rebuilt: Rebuilt) -> dict[str, Any]:
@@ -234,7 +238,7 @@ def _row(row: Row, rebuilt: Rebuilt) -> dict[str, Any]:
         "defense": spec.written(row.defense),
         "attack": None if row.attack is None else spec.written(row.attack),
         "task": spec.written(row.task),
-        "cell_id": rebuilt.ran.cells[row.name],
+        "cell_ids": list(rebuilt.ran.cells[row.name]),
         "note": rebuilt.notes[row.name],
     }
 
@@ -255,4 +259,9 @@ def _evidence(evidence: Evidence) -> dict[str, Any]:
 def _fields(value: Interval | None) -> dict[str, Any]:
     if value is None:
         return {"ours": None, "low": None, "high": None, "photographs": 0}
-    return {"ours": value.mean, "low": spec.finite(value.low), "high": spec.finite(value.high), "photographs": value.count}
+    return {
+        "ours": spec.finite(value.mean),
+        "low": spec.finite(value.low),
+        "high": spec.finite(value.high),
+        "photographs": value.count,
+    }

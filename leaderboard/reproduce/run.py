@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,7 +46,7 @@ class Ran:
     """Rows, and what the runner recorded of them."""
 
     rows: tuple[Row, ...]
-    cells: Mapping[str, str]  # row's name -> the cell_id of its records
+    cells: Mapping[str, tuple[str, ...]]  # row's name -> the cell_id of its records, for each seed
     records: Mapping[str, tuple[Record, ...]]  # cell_id -> its records
 
 
@@ -104,13 +105,30 @@ def rebuild(table: Table, setting: Setting, judged: Judged, out: Path, engine: E
         if a file is missing or does not fit; nothing has been written then.
     """
     rows = (*table.rows(setting), *table.borrowed(setting))
-    return weigh(table, setting, judged, execute(rows, setting, judged, out, table.name, engine))
+    return weigh(table, setting, judged, execute(rows, setting, judged, out, table.name, engine, seeds(table, setting)))
 
 
-def execute(rows: Sequence[Row], setting: Setting, judged: Judged, out: Path, title: str, engine: Engine = HERE) -> Ran:
-    """Run the rows, one plan for each task; records that `out` holds are not made again."""
-    plans = [_plan(task, rows, setting, judged) for task in dict.fromkeys(row.task for row in rows)]
-    cells = {row.name: _cell(row, plans) for row in rows}
+def seeds(table: Table, setting: Setting) -> range:
+    """That a table is done with."""
+    return range(setting.seed, setting.seed + (setting.profile.seeds if table.repeated else 1))
+
+
+def execute(
+    rows: Sequence[Row],
+    setting: Setting,
+    judged: Judged,
+    out: Path,
+    title: str,
+    engine: Engine = HERE,
+    seeds: Iterable[int] | None = None,
+) -> Ran:
+    """Run the rows, one plan for each task and seed, that of the setting alone for None.
+
+    Records that `out` holds are not made again.
+    """
+    tasks, each = dict.fromkeys(row.task for row in rows), (setting.seed,) if seeds is None else seeds
+    plans = [_plan(task, rows, setting, judged, seed) for seed in each for task in tasks]
+    cells = {row.name: _cells(row, plans) for row in rows}
     found: list[Record] = []
     with Progress(f"{title}: {len(judged.names)} {judged.name}, {len(rows)} rows", sum(map(len, plans))) as progress:
         for record in runner.execute(plans, out, engine):
@@ -143,8 +161,8 @@ def weigh(table: Table, setting: Setting, judged: Judged, ran: Ran) -> Rebuilt:
 
 
 def of(ran: Ran, row: str) -> tuple[Record, ...]:
-    """The records of a row."""
-    return ran.records.get(ran.cells[row], ())
+    """The records of a row, those of the first seed first."""
+    return tuple(record for cell in ran.cells[row] for record in ran.records.get(cell, ()))
 
 
 def failures(ran: Ran) -> int:
@@ -152,39 +170,45 @@ def failures(ran: Ran) -> int:
     return sum(record["status"] == "failed" for records in ran.records.values() for record in records)
 
 
+def _value(measure: Measure, record: Record) -> float | None:
+    value: float | None = record["metrics"].get(measure.metric)
+    worst = math.inf if measure.median and measure.metric in record["metrics"] else None
+    return worst if value is None else value
+
+
 def _interval(measure: Measure, column: pd.Series) -> Interval:
+    if measure.median:
+        return Interval(float(column.median()), -math.inf, math.inf, len(column))
     return proportion(column / measure.times, measure.times) if measure.share else interval(column)
 
 
-def _plan(task: Task, rows: Sequence[Row], setting: Setting, judged: Judged) -> Plan:
+def _plan(task: Task, rows: Sequence[Row], setting: Setting, judged: Judged, seed: int) -> Plan:
     pairs = [(row.defense, row.attack) for row in rows if row.task == task]
     defenses = list(dict.fromkeys(defense for defense, _ in pairs))
     pairs.sort(key=lambda pair: defenses.index(pair[0]))  # so that each photograph is protected once by each
     return runner.prepare_pairs(
-        pairs, judged.chosen or None, task=task, extractor=setting.extractor, dataset=judged.dataset, seed=setting.seed
+        pairs, judged.chosen or None, task=task, extractor=setting.extractor, dataset=judged.dataset, seed=seed
     )
 
 
-def _cell(row: Row, plans: Sequence[Plan]) -> str:
-    found = [
-        cell.head["cell_id"]
+def _cells(row: Row, plans: Sequence[Plan]) -> tuple[str, ...]:
+    return tuple(
+        str(cell.head["cell_id"])
         for plan in plans
         for cell in plan.cells
         if (plan.task, cell.defense, cell.attack) == (row.task, row.defense, row.attack)
-    ]
-    return str(found[0])
+    )
 
 
 def _columns(table: Table, ran: Ran) -> dict[Cell, pd.Series]:
-    """The values of each cell by unit, in the paper's unit of measurement."""
+    """The values of each cell by unit and seed, in the paper's unit of measurement."""
     return {
         (row.name, measure): pd.Series(
             {
-                record["unit"]: record["metrics"][wanted.metric] * wanted.times
+                f"{record['unit']} {record['seed']}": value * wanted.times
                 for record in of(ran, row.name)
-                if record["status"] == "ok"
-                and record["metrics"].get(wanted.metric) is not None
-                and wanted.condition in (None, record.get("condition"))
+                if record["status"] == "ok" and wanted.condition in (None, record.get("condition"))
+                if (value := _value(wanted, record)) is not None
             },
             dtype=float,
         )
@@ -196,7 +220,11 @@ def _columns(table: Table, ran: Ran) -> dict[Cell, pd.Series]:
 def _correlation(table: Table, rows: Iterable[Row], ours: Mapping[Cell, Interval]) -> float | None:
     if table.ordered is None:
         return None
-    both = [(row.paper[table.ordered], ours[row.name, table.ordered].mean) for row in rows if (row.name, table.ordered) in ours]
+    both = [
+        (row.paper[table.ordered], ours[row.name, table.ordered].mean)
+        for row in rows
+        if table.ordered in row.paper and (row.name, table.ordered) in ours
+    ]
     return rank_correlation(*zip(*both, strict=True)) if len(both) > 1 else None
 
 

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from bench import fields, registry, spec
-from bench.plugin import Asset, Attack, Defense, Plugin, Task
+from bench.features.sift import Sift
+from bench.plugin import Asset, Attack, Dataset, Defense, Extractor, Plugin, Task
 from bench.registry import Kind
 from bench.tasks.reconstruction import Reconstruction
 from leaderboard.reproduce.claims import Cell, Claim
-from leaderboard.reproduce.profiles import Setting
+from leaderboard.reproduce.profiles import Profile, Setting
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from leaderboard.reproduce.drawing import Scene
 
 P = TypeVar("P", bound=Plugin)
 
@@ -37,6 +43,7 @@ class Measure:
     digits: int = 3  # shown after the point
     condition: str | None = None  # of the units that count, if not all do
     share: bool = False  # whether each unit has 1 or 0 of it
+    median: bool = False  # whether it is the median over units, of which one without a value is the worst, and not their mean
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,10 +55,13 @@ class Table:
     measures: Mapping[str, Measure]
     rows: Callable[[Setting], tuple[Row, ...]]
     claims: Callable[[Mapping[Cell, float]], tuple[Claim, ...]]  # given the paper's values of all cells
-    place: bool = False  # whether it is about the queries of a place
+    place: Callable[[Profile], Dataset] | None = None  # that it is about, unless another is named; None for photographs
+    extractor: Callable[[Profile], Extractor] = lambda profile: Sift()  # of its features, unless another is named
+    repeated: bool = False  # whether its rows are done with as many seeds as the profile says
     ordered: str | None = None  # the measure by which paper's and our rows are ranked
     # Rows of other tables that claims compare with.
     borrowed: Callable[[Setting], tuple[Row, ...]] = field(default=lambda setting: ())
+    draw: Callable[[Scene], Iterator[tuple[str, Figure]]] | None = None  # figures that come with it, as those of a `Drawing`
     notes: tuple[str, ...] = ()
 
 

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from bench.datasets import photographs
-from bench.features.sift import Sift
 from bench.runner import Asked
 from bench.suite import Suite
-from leaderboard.reproduce import tables
+from leaderboard.reproduce import run, tables
 from leaderboard.reproduce.profiles import CPU, Materials, Setting
 
 
@@ -15,7 +14,8 @@ def of_table(name: str) -> Suite:
 
     Records are those of `bench reproduce`, which finds them if it is given the folder.
     """
-    table, extractor = tables.everything()[name], Sift()
+    table = tables.everything()[name]
+    extractor = table.extractor(CPU)
     setting = Setting(profile=CPU, materials=Materials(), extractor=extractor, photographs=len(photographs.builtin()))
     rows = (*table.rows(setting), *table.borrowed(setting))
     parts = [
@@ -24,9 +24,10 @@ def of_table(name: str) -> Suite:
             images=None,
             task=task,
             extractor=extractor,
-            dataset=CPU.place if table.place else None,
-            seed=0,
+            dataset=None if table.place is None else table.place(CPU),
+            seed=seed,
         )
+        for seed in run.seeds(table, setting)
         for task in dict.fromkeys(row.task for row in rows)
     ]
     return Suite(summary=table.title, parts=tuple(parts))

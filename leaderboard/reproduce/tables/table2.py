@@ -104,7 +104,7 @@ TABLE = Table(
     measures={**places.measures(recall="day"), **places.told("day")},
     rows=rows,
     claims=claims,
-    place=True,
+    place=places.queried,
     ordered=MEASURE,
     notes=places.NOTES,
 )

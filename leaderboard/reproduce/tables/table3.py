@@ -1,8 +1,12 @@
-"""Table 3: how LDP-Feat is matched, where its dictionary is from, and how long RANSAC tries (|K| = 256k, ε = 10, m = 2)."""
+"""Table 3: how LDP-Feat is matched, where its dictionary is from, and how long RANSAC tries (|K| = 256k, ε = 10, m = 2).
+
+A row of ours comes last: references retrieved by the released words alone, which leak nothing beyond the release.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 from leaderboard.reproduce import places, published
 from leaderboard.reproduce.claims import Cell, Claim, falling, greater, same_order
@@ -16,6 +20,7 @@ POINT = ("256000", "10", 2)  # |K|, ε, m
 MATCHERS = {"voc-match": "vocabulary", "mutual-nn": "mutual-nn"}
 DICTIONARIES = {"Aachen Ref.": "references", "Places365": "shipped"}
 TRIALS = {"10M": 10_000_000, "1M": 1_000_000, "100k": 100_000, "10k": 10_000}
+RELEASED = "retrieval by released words"
 CPU_TRIALS = {"10M": 100_000, "1M": 30_000, "100k": 10_000, "10k": 3_000}  # a profile that cannot make the paper's makes these
 
 
@@ -36,7 +41,14 @@ def rows(setting: Setting) -> tuple[Row, ...]:
                 task=task,
             )
         )
-    return tuple(found)
+    ours = replace(
+        found[0],
+        name=RELEASED,
+        labels={**found[0].labels, "ablation": "retrieval (ours)", "variable": "released words"},
+        paper={},
+        task=places.task(setting, retrieval="released"),
+    )
+    return (*found, ours)
 
 
 def _trials(setting: Setting, variable: str) -> dict[str, int]:
@@ -74,7 +86,10 @@ TABLE = Table(
     measures={**places.measures(recall="day"), **places.told("day")},
     rows=rows,
     claims=claims,
-    place=True,
+    place=places.queried,
     ordered=MEASURE,
-    notes=places.NOTES,
+    notes=(
+        *places.NOTES,
+        "The last row is ours, and no row of the paper: there, references are retrieved by the released words alone.",
+    ),
 )

@@ -47,7 +47,7 @@ TABLE = Table(
     measures={**places.measures(day="day", night="night")},
     rows=rows,
     claims=claims,
-    place=True,
+    place=places.queried,
     ordered=DAY[0],
     notes=places.NOTES,
 )

@@ -1,0 +1,32 @@
+"""What the strongest attacker sees of a query, beside whether the server localizes it: same images, words, ε and m for both."""
+
+from attacks.dia import DIA
+from attacks.keypoints import Keypoints
+from attacks.lattice import Lattice
+from bench.datasets.gallery import Gallery
+from bench.plugin import Asset
+from bench.suite import Suite, grid
+from bench.tasks.localization import Localization
+from bench.tasks.reconstruction import Reconstruction
+from defenses.affine import Affine
+from defenses.ldp import LDP
+from defenses.none import Undefended
+
+DIMS = (2, 4, 8, 16)
+EPSILONS = (8, 10, 12, 14, 16)
+SIZES = (1, 2, 4)  # words released per keypoint, at ε = 10
+
+SUITE = Suite(
+    summary="reconstruction and localization of the same queries of a gallery, with the shipped dictionary",
+    parts=grid(
+        defenses=[
+            Undefended(),
+            *(Affine(dim=dim) for dim in DIMS),
+            *(LDP(epsilon=epsilon, dictionary=Asset("shipped")) for epsilon in EPSILONS),
+            *(LDP(epsilon=10, subset_size=size, dictionary=Asset("shipped")) for size in SIZES if size != LDP.subset_size),
+        ],
+        attacks=[DIA(), Lattice(), Keypoints()],
+        tasks=[Reconstruction(), Localization()],
+        datasets=[Gallery(queries=60, night=0.0)],
+    ),
+)
