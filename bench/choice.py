@@ -9,9 +9,9 @@
 
        1 − (1 − C(I, s) / C(I + W, s))^T
 
-   is the chance that one is all right, and finds the pose. A wrong pose is agreed with by its own sample and by Poisson(a W)
-   other matches, a being the chance that a point which is somewhere in the image is within RANSAC's threshold. The pose is kept
-   if more agree with it than with the best of T wrong ones: with probability F(I − s − 1)^T, F being Poisson's distribution.
+   is the chance that one is all right, and finds the pose. A wrong pose is agreed with by its own sample and Poisson(a W) other
+   matches, a being the chance that a point which is somewhere in the image is within RANSAC's threshold. The pose is kept if more
+   agree with it than with the best of T wrong ones, which is so with probability F(I − s − 1)^T, F being Poisson's distribution.
 
    p / m falls with m, so that the share of right matches is greatest for m = 1; but of fewer right matches, too few may be left.
 """

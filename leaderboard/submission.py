@@ -253,8 +253,9 @@ def _impossible(cell: Cell, members: Sequence[Line], plan: Plan) -> Iterator[Fau
             yield Fault(line.number, f"unit: the dataset has no {record['unit']!r}")
         right = trials.privacy(cell, record["privacy"]["keypoints"])
         for name, value in right.items():
-            if not _close(record["privacy"][name], value):
-                yield Fault(line.number, f"privacy.{name}: is {_short(record['privacy'][name])}, should be {_short(value)}")
+            told = record["privacy"].get(name)
+            if not _close(told, value):
+                yield Fault(line.number, f"privacy.{name}: is {_short(told)}, should be {_short(value)}")
     missing = sorted(names - {line.record["unit"] for line in members}) if cell.reason is None else []
     if missing:
         yield Fault(first.number, f"its cell lacks {len(missing)} of {len(names)} units, such as {missing[0]!r}")

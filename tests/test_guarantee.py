@@ -5,6 +5,7 @@ import re
 import shlex
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import bench
@@ -12,7 +13,7 @@ from bench import cli
 from bench.audit.bounds import log_ratio
 from bench.composition import epsilon_left
 from bench.features.dictionary import Dictionary
-from bench.kernels.subset import log10_chance, most_accurate_size, most_informative_size
+from bench.kernels.subset import information, log10_chance, most_accurate_size, most_informative_size
 from bench.public import Public
 from bench.testing import example_features
 from defenses.ldp import LDP
@@ -24,7 +25,7 @@ MILLION = "audit --defense ldp:epsilon=2,subset_size=2 --words 64 --trials 10000
 
 def test_all_commands_are_found() -> None:
     assert MILLION in COMMANDS
-    assert len(COMMANDS) == PAGE.count("```\nbench ") == 3
+    assert len(COMMANDS) == PAGE.count("```\nbench ") == 6
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -58,6 +59,23 @@ def test_numbers() -> None:
     assert f"one released word in {round(one_in, -3):,.0f} is the true one" in PAGE
     assert f"**{most_informative_size(10.0, words)}** of 256,000 words" in PAGE
     assert f"**{most_accurate_size(10.0, words)}** at the same point" in PAGE
+
+
+def test_what_sets_of_each_size_tell() -> None:
+    """Of the table of sizes: what does not rest on measurements."""
+    rows = re.findall(r"^\| (\d+)[^|]*\| ([\d.]+) \| ([\d.]+) \|", PAGE, re.MULTILINE)
+    assert [int(size) for size, _, _ in rows] == [
+        1,
+        2,
+        4,
+        8,
+        most_accurate_size(6.534, 8000),
+        16,
+        most_informative_size(6.534, 8000),
+    ]
+    for size, told, bits in rows:
+        assert f"{10 ** log10_chance(6.534, 8000, int(size)):.3f}" == told
+        assert f"{information(6.534, 8000, np.array([int(size)]))[0] / math.log(2):.2f}" == bits
 
 
 def test_how_much_trials_can_show() -> None:

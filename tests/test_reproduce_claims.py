@@ -250,7 +250,9 @@ def test_the_defenses_of_table_4_tell_the_truth_as_often_as_the_papers() -> None
 def test_the_trials_of_table_3_are_those_of_the_issue() -> None:
     """10M, 1M, 100k and 10k of the paper's; of profile cpu as many as two cores can make."""
     settings = {name: dataclasses.replace(SETTING, profile=profile) for name, profile in PROFILES.items()}
-    made = {name: {row.name: dataclasses.asdict(row.task)["trials"] for row in table3.rows(own)} for name, own in settings.items()}
+    made = {
+        name: {row.name: dataclasses.asdict(row.task)["trials"] for row in table3.rows(own)} for name, own in settings.items()
+    }
     assert [made["paper"][row] for row in table3.TRIALS] == [10_000_000, 1_000_000, 100_000, 10_000]
     assert [made["cpu"][row] for row in table3.TRIALS] == [100_000, 30_000, 10_000, 3_000]
     assert [made["smoke"][row] for row in table3.TRIALS] == [3_333, 1_000, 333, 100]

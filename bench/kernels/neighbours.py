@@ -43,9 +43,8 @@ class Neighbours:
 
     def _find(self, words: Indices, count: int) -> Indices:
         rows = torch.from_numpy(words)
-        tops = torch.cat(
-            [self._own_first(rows, at).topk(min(count, BLOCK, self._size(at)), dim=1).values for at in self._starts()], 1
-        )
+        blocks = (self._own_first(rows, at) for at in self._starts())
+        tops = torch.cat([block.topk(min(count, block.shape[1]), dim=1).values for block in blocks], dim=1)
         least = tops.topk(count, dim=1).values[:, -1:]  # (n, 1)
         found = [[part.cpu().numpy() for part in self._at_least(rows, least, at)] for at in self._starts()]
         owners, others, cosines = (np.concatenate(parts) for parts in zip(*found, strict=True))
@@ -75,9 +74,6 @@ class Neighbours:
 
     def _starts(self) -> range:
         return range(0, len(self._words), BLOCK)
-
-    def _size(self, start: int) -> int:
-        return min(BLOCK, len(self._words) - start)
 
     def levels(self, words: Indices, borders: Doubles) -> Indices:
         """How many words have a cosine with each that is at least so many of the borders.
