@@ -58,10 +58,11 @@ def test_levels_and_what_stands_where() -> None:
             assert np.flatnonzero(levels[asked[row]] == level)[place] == word
 
 
-def test_a_word_is_looked_at_alone_as_among_others() -> None:
+def test_a_word_is_looked_at_alone_as_among_others(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is found is a function of two words, not of a batch."""
     codes, borders = words(), np.linspace(0.1, 0.9, 30)
     near = Neighbours(codes)
     together = near.levels(np.arange(300), borders)
+    monkeypatch.setattr(neighbours, "REMEMBERED", 0)
     alone = np.concatenate([near.levels(np.array([word]), borders) for word in range(0, 300, 17)])
     np.testing.assert_array_equal(alone, together[::17])

@@ -18,6 +18,7 @@ Doubles = NDArray[np.float64]
 
 BLOCK = 2048  # words in a block
 BATCH = 512  # words that are asked for at a time
+REMEMBERED = 2**26  # numbers of levels, at most
 
 
 class Neighbours:
@@ -28,6 +29,7 @@ class Neighbours:
         self._words = exact.to(pick_device())  # (K, D)
         self._lengths = exact.double().square().sum(dim=1).sqrt().to(pick_device())  # (K,)
         self._nearest: dict[int, Indices] = {}  # how many -> (K, count), -1 where they were never asked for
+        self._levels: dict[bytes, NDArray[np.int32]] = {}  # borders -> (K, blocks, L + 1), the same
 
     def nearest(self, words: Indices, count: int) -> Indices:
         """Each word itself, and the count − 1 others of greatest cosine, ties to the lowest index. (n,) -> (n, count), ascending
@@ -76,7 +78,7 @@ class Neighbours:
         return range(0, len(self._words), BLOCK)
 
     def levels(self, words: Indices, borders: Doubles) -> Indices:
-        """How many words have a cosine with each that is at least so many of the borders.
+        """How many words have a cosine with each that is at least so many of the borders. Few enough of them are remembered.
 
         Parameters
         ----------
@@ -87,6 +89,15 @@ class Neighbours:
         -------
         (n, blocks, L + 1) for each block of words
         """
+        shape = (len(self._words), len(self._starts()), len(borders) + 1)
+        if np.prod(shape) > REMEMBERED:
+            return self._find_levels(words, borders)
+        table = self._levels.setdefault(borders.tobytes(), np.full(shape, -1, dtype=np.int32))
+        missing = np.unique(words[table[words, 0, 0] < 0])
+        table[missing] = self._find_levels(missing, borders)
+        return table[words].astype(np.int64)
+
+    def _find_levels(self, words: Indices, borders: Doubles) -> Indices:
         found = np.empty((len(words), len(self._starts()), len(borders) + 1), dtype=np.int64)
         for start in range(0, len(words), BATCH):
             rows = torch.from_numpy(words[start : start + BATCH])
