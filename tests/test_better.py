@@ -1,0 +1,45 @@
+"""What tools/better.py compares can be compared, and its verdicts say what the intervals do."""
+
+from pathlib import Path
+
+import pytest
+
+from bench import registry, spec
+from leaderboard.reproduce.intervals import Interval
+
+
+@pytest.fixture(autouse=True)
+def tools(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(Path(__file__).resolve().parents[1] / "tools")
+
+
+def test_each_row_is_served_by_the_network_of_its_defense() -> None:
+    import better
+
+    rows = better.rows()
+    assert len({text for _, _, text in rows}) == len(rows)
+    assert {name.partition(":")[0] for _, name, _ in rows} == better.SERVED.keys()
+    for _, name, text in rows:
+        defense = spec.read(text, registry.DEFENSE)
+        for field, setting in better.SERVED[name.partition(":")[0]].items():
+            assert getattr(defense, field) in setting
+    bases = [epsilon for epsilon, name, _ in rows if name == better.BASE]
+    assert {epsilon for epsilon, name, _ in rows if not name.startswith("metric-ldp")} == set(bases)
+
+
+@pytest.mark.parametrize(
+    ("seen", "gained", "told"),
+    [
+        ((-0.1, -0.01), (1.0, 9.0), "**dominates**"),
+        ((-0.1, 0.01), (1.0, 9.0), "server does more, attacker cannot be told"),
+        ((0.1, 0.2), (1.0, 9.0), "attacker sees more, server does more"),
+        ((0.1, 0.2), (-9.0, -1.0), "is dominated"),
+        ((-0.1, 0.2), (-9.0, -1.0), "server does less, attacker cannot be told"),
+        ((-0.2, -0.1), (-9.0, 1.0), "attacker sees less"),
+        ((-0.2, 0.1), (-9.0, 1.0), "cannot be told"),
+    ],
+)
+def test_verdicts(seen: tuple[float, float], gained: tuple[float, float], told: str) -> None:
+    import better
+
+    assert better.verdict(*(Interval(sum(ends) / 2, *ends, 10) for ends in (seen, gained))) == told
