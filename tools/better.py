@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -27,8 +28,9 @@ from attacks.repeat import Repeat
 from bench import registry, spec
 from bench.datasets.gallery import Gallery
 from bench.datasets.photographs import folder
+from bench.datasets.scene import Scene
 from bench.features.sift import Sift
-from bench.plugin import Asset, Attack, Between, Defense, OneOf
+from bench.plugin import Asset, Attack, Between, Dataset, Defense, OneOf
 from bench.public import ASSETS
 from bench.records import Record
 from bench.tasks.localization import Localization
@@ -99,6 +101,17 @@ def rows() -> list[tuple[str, str, str]]:
     return found + by_distance
 
 
+@dataclass(frozen=True, kw_only=True)
+class FirstQueries(Dataset):
+    """The gallery with its first queries, which are by day; the references are those of the whole, and so are map and words."""
+
+    first: int
+
+    def scene(self) -> Scene:
+        whole = Gallery().scene()
+        return replace(whole, queries=whole.queries[: self.first])
+
+
 class Study:
     """Networks that were trained equally long, what they paint, and what a server does, each measured once."""
 
@@ -154,7 +167,7 @@ class Study:
     def served(self) -> dict[str, list[Record]]:
         """How well queries are localized. -> defense -> records"""
         texts = [text for _, _, text in rows()]
-        place = Gallery(queries=self.queries, night=0)
+        place = FirstQueries(first=self.queries)
         defenses = [_read(text, "" if text.startswith("privunit") else "references") for text in texts]
         records = bench.run(defenses, task=Localization(), dataset=place, out=self.work / "localization")
         return {text: records[number :: len(texts)] for number, text in enumerate(texts)}
