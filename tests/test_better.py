@@ -43,3 +43,8 @@ def test_verdicts(seen: tuple[float, float], gained: tuple[float, float], told: 
     import better
 
     assert better.verdict(*(Interval(sum(ends) / 2, *ends, 10) for ends in (seen, gained))) == told
+    dominating = "Dominating" in better.summary([("`one`", "cannot be told"), ("`other`", told)])
+    assert dominating == (told == better.DOMINATES)
+    assert ("higher, beyond chance, for `other`" in better.summary([("`other`", told)])) == (
+        "server does more" in told and not dominating
+    )

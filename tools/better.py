@@ -61,6 +61,7 @@ SETTINGS = {  # beside ε and |K|; those that are compared
 }
 DISTANCES = (16, 24)  # ε of metric-ldp, per unit of distance
 WITHIN = "recall_0.25m_2deg"
+DOMINATES = "**dominates**"
 Attacked = Mapping[str, Mapping[str, Sequence[Record]]]  # defense -> attack -> records
 Served = Mapping[str, Sequence[Record]]
 BASE = "ldp:subset_size=2"  # the paper's, which the others are compared with
@@ -245,15 +246,26 @@ def comparisons(attacked: Attacked, served: Served, alone: np.ndarray) -> list[s
     """Paired differences from the paper's defense at the same ε, and whether one is better in both."""
     lines = [markdown_row(("ε", f"less `{BASE}`", "SSIM", "recall, points", "says")), markdown_row(["---"] * 5)]
     bases = {epsilon: text for epsilon, name, text in rows() if name == BASE}
+    told = []
     for epsilon, name, text in rows():
         base = bases.get(epsilon)
         if base is None or base == text:
             continue
         seen = interval(strongest(attacked, text, alone) - strongest(attacked, base, alone))
         gained = interval(100 * (recall(served, text) - recall(served, base)))
-        cells = (epsilon, f"`{name}`", written(seen, 3, "+"), written(gained, 1, "+"), verdict(seen, gained))
-        lines.append(markdown_row(cells))
-    return lines
+        told.append((f"`{name}` at {epsilon}", verdict(seen, gained)))
+        lines.append(markdown_row((epsilon, f"`{name}`", written(seen, 3, "+"), written(gained, 1, "+"), told[-1][1])))
+    return [*lines, "", summary(told)]
+
+
+def summary(told: Sequence[tuple[str, str]]) -> str:
+    """Whether one of the rows dominates the paper's defense, in words."""
+    dominating = [name for name, said in told if said == DOMINATES]
+    gaining = [name for name, said in told if "server does more" in said]
+    if dominating:
+        return f"Dominating `{BASE}`, with higher recall and less to be seen, beyond chance: {', '.join(dominating)}."
+    more = f"Recall is higher, beyond chance, for {', '.join(gaining)}." if gaining else "No recall is higher, beyond chance."
+    return f"**None dominates `{BASE}`**: none has a higher recall at the same ε while no attack does better. {more}"
 
 
 def verdict(seen: Interval, gained: Interval) -> str:
@@ -261,7 +273,7 @@ def verdict(seen: Interval, gained: Interval) -> str:
     attacker = "sees more" if seen.low > 0 else "sees less" if seen.high < 0 else ""
     server = "does more" if gained.low > 0 else "does less" if gained.high < 0 else ""
     if server == "does more" and attacker != "sees more":
-        return "**dominates**" if attacker else "server does more, attacker cannot be told"
+        return DOMINATES if attacker else "server does more, attacker cannot be told"
     if server == "does less" and attacker != "sees less":
         return "is dominated" if attacker else "server does less, attacker cannot be told"
     parts = [f"attacker {attacker}"] * bool(attacker) + [f"server {server}"] * bool(server)
