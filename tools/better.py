@@ -265,7 +265,7 @@ def summary(told: Sequence[tuple[str, str]]) -> str:
     if dominating:
         return f"Dominating `{BASE}`, with higher recall and less to be seen, beyond chance: {', '.join(dominating)}."
     more = f"Recall is higher, beyond chance, for {', '.join(gaining)}." if gaining else "No recall is higher, beyond chance."
-    return f"**None dominates `{BASE}`**: none has a higher recall at the same ε while no attack does better. {more}"
+    return f"**None is shown to dominate `{BASE}`**, by a higher recall at the same ε with less to be seen. {more}"
 
 
 def verdict(seen: Interval, gained: Interval) -> str:
