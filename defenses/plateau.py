@@ -11,8 +11,8 @@ word.
 
 The ω-subset mechanism tells the true word and spends the rest on words that are drawn from all alike. Here the words near the
 true one are as likely as it is. Where p is small, each is told nearly as often as `ldp` tells the true one: with m t e^ε well
-below |K|, t costs the true word little, and where p is large, much. A server that meets the descriptor again may quantise it to a near
-word; an attacker likes a near word almost as much as the true one. docs/better.md measures both.
+below |K|, t costs the true word little, and where p is large, much. A server that meets the descriptor again may quantise it to
+a near word; an attacker likes a near word almost as much as the true one. docs/better.md measures both.
 
 Sampled exactly: whether Z meets T(v) as `ldp` samples u, with the whole numbers A + B and A for |K| and m; how many words they
 share, of C(t, j) C(|K| − t, m − j) sets each; and then subsets of both, without replacement. Rows come out sorted.
