@@ -206,7 +206,7 @@ def heading(study: Study, alone: np.ndarray) -> str:
         f"Measured on {len(study.tested)} photographs of `test.txt` and the 7 built-in ones, which no "
         "network was trained or chosen on.\n"
         f"- **recall**: what a server can do, the share of {study.queries} queries of the gallery, by day, that are localized "
-        "within 0.25 m and 2°. **right of matches**: the share that the pose that was found agrees with.\n"
+        "within 0.25 m and 2°.\n"
         f"- **repeated**: the same of what `repeat` makes of {REPEATS} releases of a photograph, painted by the network for raw "
         "descriptors; **recovered**: the share of descriptors that it finds. It takes the word that recurs most, which is the "
         "likeliest for `ldp` alone.\n\n"
@@ -229,16 +229,14 @@ def strongest(attacked: Attacked, text: str, alone: np.ndarray) -> np.ndarray:
 
 
 def table(attacked: Attacked, served: Served) -> list[str]:
-    names = ("ε", "defense", "SSIM", "recall, %", "right of matches, %", "SSIM, repeated", "recovered, %")
+    names = ("ε", "defense", "SSIM", "recall, %", "SSIM, repeated", "recovered, %")
     lines = [markdown_row(names), markdown_row(["---"] * len(names))]
     for epsilon, name, text in rows():
-        metrics = [record["metrics"] for record in served[text]]
-        right = sum(each["inliers"] for each in metrics) / max(1.0, sum(each["matches"] for each in metrics))
         repeated = [record["metrics"] for record in attacked[text].get("repeat", ())]
         seen, found = written(interval(ssim(attacked, text)), 3), written(proportion(recall(served, text), 100), 1)
         told = written(interval([each["ssim"] for each in repeated]), 3) if repeated else "n/a"
         share = f"{100 * np.mean([each['recovered'] for each in repeated]):.1f}" if repeated else "n/a"
-        lines.append(markdown_row((epsilon, f"`{name}`", seen, found, f"{100 * right:.2f}", told, share)))
+        lines.append(markdown_row((epsilon, f"`{name}`", seen, found, told, share)))
     return lines
 
 
