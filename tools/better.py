@@ -71,7 +71,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--work", type=Path, required=True, help="kept between runs")
-    parser.add_argument("--start", type=Path, default=ASSETS / "inversion-none.safetensors", help="a network for raw descriptors")
+    parser.add_argument(
+        "--start",
+        type=Path,
+        default=ASSETS / "inversion-none.safetensors",
+        help="a network for raw descriptors, such as tools/leakage.py trains (default: shipped)",
+    )
     parser.add_argument("--steps", type=int, default=300, help="of each network's training (default: %(default)s)")
     parser.add_argument("--tested", type=int, default=100, help="photographs of test.txt (default: %(default)s)")
     parser.add_argument("--queries", type=int, default=120, help="of the gallery (default: %(default)s)")
@@ -198,8 +203,8 @@ def heading(study: Study, alone: np.ndarray) -> str:
         f"--tested {len(study.tested)} --queries {study.queries}\n```\n\n"
         f"|K| is {WORDS:,}: ε = {PAPERS[0] - SHIFT:.3f} tells the true word as often as ε = {PAPERS[0]} with 256,000.\n\n"
         f"- **SSIM**: what an attacker sees, of what `dia` paints with a network for that defense. Each network has {widths} "
-        f"channels, started from one for raw descriptors, and was trained for {study.steps} steps of {BATCH} crops of "
-        f"{len(study.photographs)} photographs, all alike. That is little: what they paint is a floor of what leaks, and "
+        f"channels, started from `{study.start.name}`, which paints raw descriptors, and was trained for {study.steps} steps of "
+        f"{BATCH} crops of {len(study.photographs)} photographs, all alike. That is little: what they paint is a floor of what leaks, and "
         "differences may grow or vanish with longer training. Each was trained once; how much another seed would differ is in "
         f"no interval. Positions alone, released whatever the defense, tell {written(interval(alone), 3)} to the shipped network "
         "for them: what paints worse has not learned to use what it is told, and counts as that much where rows are compared. "
