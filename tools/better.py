@@ -206,7 +206,7 @@ def heading(study: Study, alone: np.ndarray) -> str:
         f"{widths} channels, started from `{study.start.name}`, which paints raw descriptors, and was trained for {study.steps} "
         f"steps of {BATCH} crops of {len(study.photographs)} photographs, all alike. That is little: what they paint is a "
         "floor of what leaks, and differences may grow or vanish with longer training. Each was trained once; how much another "
-        f"seed would differ is in no interval. Measured on {len(study.tested)} photographs of `test.txt` and the 7 built-in ones, "
+        f"seed would differ is in no interval. Measured on {len(study.tested)} photographs of `test.txt` and the 7 built-in, "
         "which no network was trained or chosen on.\n"
         f"- Positions alone, which are released whatever the defense, tell {written(interval(alone), 3)} to the shipped network "
         "for them. What paints worse has not learned to use what it is told, and counts as that much where rows are compared.\n"
