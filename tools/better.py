@@ -35,6 +35,7 @@ from bench.public import ASSETS
 from bench.records import Record
 from bench.tasks.localization import Localization
 from defenses.none import Undefended
+from defenses.privunit import expected_cosine
 from leaderboard.reproduce.intervals import Interval, interval, proportion
 from leaderboard.tables import markdown_row
 
@@ -191,6 +192,8 @@ def page(study: Study, networks: Mapping[str, Path]) -> list[str]:
         "",
         *comparisons(attacked, served, alone),
         "",
+        *reasons(),
+        "",
     ]
 
 
@@ -259,6 +262,20 @@ def comparisons(attacked: Attacked, served: Served, alone: np.ndarray) -> list[s
         told.append((f"`{name}` at {epsilon}", verdict(seen, gained)))
         lines.append(markdown_row((epsilon, f"`{name}`", written(seen, 3, "+"), written(gained, 1, "+"), told[-1][1])))
     return [*lines, "", summary(told)]
+
+
+def reasons() -> list[str]:
+    """What the mechanisms have to work with, at these ε."""
+    cosines = ", ".join(f"{expected_cosine(paper - SHIFT, 127):.2f}" for paper in PAPERS)
+    return [
+        "What they have to work with:",
+        "",
+        "- `plateau` tells a near word as often as the true one, and the more of them there are, the less often each. A server has "
+        "use for a near word where the map's point has that one; an attacker always has.",
+        f"- `privunit` spreads ε over 127 dimensions: what it releases has a mean cosine with the (centred) descriptor of {cosines} "
+        "at these ε. No choice of |K| helps it, and a network has use for each of its vectors.",
+        "- `exponential` spends half of ε on normalisers that hardly differ, and the rest on a range of utility that few words share.",
+    ]
 
 
 def summary(told: Sequence[tuple[str, str]]) -> str:
