@@ -270,9 +270,9 @@ def reasons() -> list[str]:
     return [
         "What they have to work with:",
         "",
-        "- `plateau` tells a near word as often as the true one, and the more there are, the less often each. A server has use for "
-        "a near word where the map's point has that one; an attacker always has.",
-        f"- `privunit` spreads ε over 127 dimensions: what it releases has a mean cosine with the (centred) descriptor of "
+        "- `plateau` tells a near word as often as the true one, and the more there are, the less often each. A server has use "
+        "for a near word where the map's point has that one; an attacker always has.",
+        "- `privunit` spreads ε over 127 dimensions: what it releases has a mean cosine with the (centred) descriptor of "
         f"{cosines} at these ε. No choice of |K| helps it, and a network has use for each of its vectors.",
         "- `exponential` spends half of ε on normalisers that hardly differ, and the rest on utilities that few words have.",
     ]
