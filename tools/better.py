@@ -81,13 +81,16 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=300, help="of each network's training (default: %(default)s)")
     parser.add_argument("--tested", type=int, default=100, help="photographs of test.txt (default: %(default)s)")
     parser.add_argument("--queries", type=int, default=120, help="of the gallery (default: %(default)s)")
+    parser.add_argument(
+        "--networks", nargs="+", choices=SERVED, default=list(SERVED), help="train and attack these (default: all)"
+    )
     parser.add_argument("--only", choices=("networks", "attacks", "server"), help="do that part, and write nothing")
     args = parser.parse_args()
     study = Study(args.data, args.work, args.start, args.steps, args.tested, args.queries)
     if args.only in (None, "server"):
         study.served()
     if args.only in (None, "networks", "attacks"):
-        networks = {name: study.network(name) for name in SERVED}
+        networks = {name: study.network(name) for name in args.networks}
     if args.only in (None, "attacks"):
         study.attacked(networks)
     if args.only is None:
@@ -240,8 +243,9 @@ def table(attacked: Attacked, served: Served) -> list[str]:
     names = ("ε", "defense", "SSIM", "recall, %", "SSIM, repeated", "recovered, %")
     lines = [markdown_row(names), markdown_row(["---"] * len(names))]
     for epsilon, name, text in rows():
-        repeated = [record["metrics"] for record in attacked[text].get("repeat", ())]
-        seen, found = written(interval(ssim(attacked, text)), 3), written(proportion(recall(served, text), 100), 1)
+        repeated = [record["metrics"] for record in attacked.get(text, {}).get("repeat", ())]
+        seen = written(interval(ssim(attacked, text)), 3) if text in attacked else "n/a"
+        found = written(proportion(recall(served, text), 100), 1)
         told = written(interval([each["ssim"] for each in repeated]), 3) if repeated else "n/a"
         share = f"{100 * np.mean([each['recovered'] for each in repeated]):.1f}" if repeated else "n/a"
         lines.append(markdown_row((epsilon, f"`{name}`", seen, found, told, share)))
