@@ -12,7 +12,7 @@ from defenses.affine import Affine
 from defenses.ldp import LDP
 from defenses.none import Undefended
 
-DIMS = (2, 4, 8, 16)
+DIMS = (4, 16)
 EPSILONS = (8, 10, 12, 14, 16)
 SIZES = (1, 2, 4)  # words released per keypoint, at ε = 10
 

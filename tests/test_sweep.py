@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,9 @@ from fake_plugins.guess import Guess
 from fake_plugins.painter import Painter
 from fakes import FAKES, album, install
 
+from attacks.dia import DIA
 from bench import cli, engines, rundir, runner, suite, threads
+from bench.datasets.gallery import Gallery
 from bench.errors import UserError
 from bench.plugin import Asset
 from bench.records import FILE, Log, Record
@@ -109,6 +112,18 @@ def test_every_suite_of_ours_can_be_planned() -> None:
     assert all(each.parts and each.summary for each in found.values())
     assert len(found["full"].parts) == sum(len(each.parts) for name, each in found.items() if name != "full")
     assert len(runner.planned(found["smoke"].parts[0])) == 9
+
+
+def test_privacy_and_utility_are_told_of_the_same_queries_and_defenses() -> None:
+    few = Gallery(views=2, queries=1, night=0.0, width=64, height=48, detail=0.1)
+    attacked, served = (
+        [cell for cell in runner.planned(replace(part, dataset=few)).cells if cell.reason is None]
+        for part in suite.find("privacy-utility").parts
+    )
+    assert [{cell.head["task"] for cell in cells} for cells in (attacked, served)] == [{"reconstruction"}, {"localization"}]
+    assert len({cell.head["dataset"]["hash"] for cell in (*attacked, *served)}) == 1
+    adapted = [cell.defense for cell in attacked if isinstance(cell.attack, DIA)]
+    assert adapted == [cell.defense for cell in served]
 
 
 def test_photographs_of_ones_own() -> None:
