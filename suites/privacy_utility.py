@@ -27,6 +27,6 @@ SUITE = Suite(
         ],
         attacks=[DIA(), Lattice(), Keypoints()],
         tasks=[Reconstruction(), Localization()],
-        datasets=[Gallery(queries=60, night=0.0)],
+        datasets=[Gallery(queries=50, night=0.0)],
     ),
 )
