@@ -190,7 +190,7 @@ def _read(text: str, dictionary: str = "") -> Defense:
 def page(study: Study, networks: Mapping[str, Path]) -> list[str]:
     attacked, served, alone = study.attacked(networks), study.served(), study.positions()
     return [
-        heading(study, alone),
+        heading(study, networks, alone),
         *table(attacked, served),
         "",
         *comparisons(attacked, served, alone),
@@ -200,13 +200,13 @@ def page(study: Study, networks: Mapping[str, Path]) -> list[str]:
     ]
 
 
-def heading(study: Study, alone: np.ndarray) -> str:
+def heading(study: Study, networks: Mapping[str, Path], alone: np.ndarray) -> str:
     widths = ", ".join(map(str, study.widths))
     return (
         "# Better defenses at the same ε?\n\n"
         "Written by `tools/better.py`, which rebuilds the networks and all numbers here:\n\n"
         f"```\npython tools/better.py --data ../shared/data --work work/better --start {study.start.name} --steps {study.steps} "
-        f"--tested {len(study.tested)} --queries {study.queries}\n```\n\n"
+        f"--tested {len(study.tested)} --queries {study.queries} --networks {' '.join(networks)}\n```\n\n"
         f"|K| is {WORDS:,}: ε = {PAPERS[0] - SHIFT:.3f} tells the true word as often as ε = {PAPERS[0]} with 256,000.\n\n"
         "- **SSIM**: what an attacker sees, of what `dia` paints with a network for that defense. Each network has "
         f"{widths} channels, started from `{study.start.name}`, which paints raw descriptors, and was trained for {study.steps} "
@@ -221,6 +221,7 @@ def heading(study: Study, alone: np.ndarray) -> str:
         f"- **repeated**: the same of what `repeat` makes of {REPEATS} releases of a photograph, painted by the network for raw "
         "descriptors; **recovered**: the share of descriptors that it finds. It takes the word that recurs most, which is the "
         "likeliest for `ldp` alone.\n\n"
+        "n/a: no network was trained for that defense, or it releases no words, which `repeat` needs. "
         "In brackets: 95% bootstrap over photographs, or Wilson's interval over queries.\n"
     )
 
