@@ -46,6 +46,8 @@ def place_labels(
 ) -> list[tuple[float, float] | None]:
     """Where each label goes so that it covers no point, no other label and no border; None for one that finds no room.
 
+    A label is nearer to its own point than to any other: what stands beside another's would be read as its.
+
     Parameters
     ----------
     points : (x, y) in pixels, y downward
@@ -59,19 +61,29 @@ def place_labels(
     """
     taken = [_box(x - gap / 2, y, gap, gap) for x, y in points]
     placed: list[tuple[float, float] | None] = []
-    for (x, y), (width, height) in zip(points, sizes, strict=True):
+    for number, ((x, y), (width, height)) in enumerate(zip(points, sizes, strict=True)):
         corners = [(left, y + side * (gap + height) / 2) for side in (-1, 1) for left in (x + gap / 2, x - gap / 2 - width)]
         above = [(x - width / 2, y + side * (gap + height / 2)) for side in (-1, 1)]
         beside = [(x + gap, y), (x - gap - width, y)]
-        chosen = next((place for place in (*corners, *above, *beside) if _free(_box(*place, width, height), taken, size)), None)
-        if chosen:
-            taken.append(_box(*chosen, width, height))
+        places = ((place, _box(*place, width, height)) for place in (*corners, *above, *beside))
+        chosen, box = next(
+            ((at, box) for at, box in places if _free(box, taken, size) and _own(box, number, points)), (None, None)
+        )
+        if box is not None:
+            taken.append(box)
         placed.append(chosen)
     return placed
 
 
 def _box(left: float, middle: float, width: float, height: float) -> NDArray[np.float64]:
     return np.array([left, middle - height / 2, left + width, middle + height / 2])
+
+
+def _own(box: NDArray[np.float64], number: int, points: Sequence[tuple[float, float]]) -> bool:
+    """Whether no other point is as near to the box as that of the number."""
+    at = np.asarray(points)
+    away = np.linalg.norm(at - np.clip(at, box[:2], box[2:]), axis=1)
+    return bool((away[number] < np.delete(away, number)).all())
 
 
 def _free(box: NDArray[np.float64], taken: Sequence[NDArray[np.float64]], size: tuple[float, float]) -> bool:

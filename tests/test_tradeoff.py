@@ -158,6 +158,17 @@ def test_labels_cover_nothing() -> None:
     assert place_labels([(5.0, 5.0)], [(400.0, 12.0)], (300.0, 300.0)) == [None]
 
 
+def test_labels_are_read_as_their_points() -> None:
+    """Also where points lie together: some of them have none then."""
+    points = [(150.0, 150.0), (150.0, 157.0), (150.0, 164.0), (40.0, 40.0)]
+    placed = place_labels(points, [(60.0, 12.0)] * 4, (300.0, 300.0))
+    assert placed[3] is not None
+    for number, place in enumerate(placed):
+        if place:
+            away = [np.hypot(max(place[0] - x, 0, x - place[0] - 60), max(abs(y - place[1]) - 6, 0)) for x, y in points]
+            assert np.argmin(away) == number
+
+
 def test_plots_are_drawn_of_what_there_is(tmp_path: Path) -> None:
     records = [
         *reconstructions(NONE, [0.8, 0.7]),
