@@ -51,7 +51,7 @@ def test_networks_were_trained_alike_and_as_the_rule_demands(path):
     meta = weights.load(path).meta
     for what in ("start", "crops", "photographs"):
         assert meta[what] == weights.load(NETWORKS[0]).meta[what], "unequal training makes an unfair comparison"
-    assert meta["photographs"] == 800
+    assert meta["photographs"] == 266
     if meta["quantisation_error"] is not None:
         check_quantisation(meta["quantisation_error"]["training"], meta["quantisation_error"]["validation"])
 

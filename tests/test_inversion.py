@@ -323,7 +323,7 @@ def test_a_network_knows_what_it_was_trained_for(sources, words, tmp_path):
     public, path = Public(), tmp_path / "W.safetensors"
     served = {"epsilon": Between(8.0, 16.0), "subset_size": OneOf((1, 2))}
     shape = Shape(inputs=2 * 128 + 2 + 2)
-    meta = {**weights.describe(LDP(dictionary=words), served, Sift(), public), "slots": 2}
+    meta = {**weights.describe(LDP(dictionary=words), served, Sift(), public), "encoding": "released", "slots": 2}
     weights.save(path, Inverter(shape), shape, meta)
     found = weights.load(path).meta
     fits = LDP(epsilon=9, subset_size=2, dictionary=words)
@@ -340,11 +340,14 @@ def test_a_network_knows_what_it_was_trained_for(sources, words, tmp_path):
     assert "dictionary sha256" in (weights.misfit(found, LDP(dictionary=Asset(copied)), Sift(), public) or "")
 
 
+OF_RAW = {**weights.describe(Undefended(), {}, Sift(), Public()), "encoding": "invariant", "slots": 1}
+
+
 def test_weights_keep_the_network(sources, tmp_path, rng):
     shape = Shape(inputs=130)
     net = Inverter(shape).eval()
     path = tmp_path / "W.safetensors"
-    weights.save(path, net, shape, {"slots": 1, "serves": {}})
+    weights.save(path, net, shape, OF_RAW)
     points = encode([example_releases(rng)[0]], [np.empty(0, np.float32)], slots=1, encoding="invariant")
     torch.testing.assert_close(paint(weights.load(path).module, points), paint(net, points), atol=0.02, rtol=0)
     assert torch.equal(paint(net, points), paint(net, points))
@@ -362,10 +365,17 @@ def test_weights_that_do_not_fit(spoil, message, tmp_path):
     from bench import tensorfile
 
     shape, path = Shape(inputs=130), tmp_path / "W.safetensors"
-    weights.save(path, Inverter(shape), shape, {"slots": 1, "serves": {}})
+    weights.save(path, Inverter(shape), shape, OF_RAW)
     arrays, meta, _ = tensorfile.load(path, weights.KIND)
     tensorfile.save(path, weights.KIND, spoil(arrays), meta)
     with pytest.raises(UserError, match=message):
+        weights.load(path)
+
+
+def test_weights_that_say_too_little(tmp_path):
+    shape, path = Shape(inputs=130), tmp_path / "W.safetensors"
+    weights.save(path, Inverter(shape), shape, {name: told for name, told in OF_RAW.items() if name != "encoding"})
+    with pytest.raises(UserError, match="do not say encoding"):
         weights.load(path)
 
 

@@ -15,7 +15,8 @@ from PIL import Image
 
 from bench import cache, cli, progress, registry
 from bench.features.sift import Sift
-from bench.plugin import Attack, Defense
+from bench.plugin import Asset, Attack, Defense
+from bench.public import ASSETS, Public
 from bench.records import FILE, Record
 from bench.tasks.reconstruction import Reconstruction
 from leaderboard.reproduce import command, figures, report, run, tables
@@ -106,6 +107,21 @@ def test_done_again_nothing_runs_and_all_stays(images: Path, out: Path) -> None:
         for name in ("table1", "table4")
     )
     assert len(first & fourth) == 12
+
+
+def unanswered(setting: Setting) -> dict[str, str | None]:
+    """Rows of tables about photographs that no attack as configured answers -> why."""
+    public = Public()
+    every = [row for table in tables.everything().values() if not table.place for row in table.rows(setting)]
+    reasons = {row.name: row.task.inapplicable(row.defense, row.attack, setting.extractor, public) for row in every}
+    return {name: reason for name, reason in reasons.items() if reason is not None}
+
+
+def test_what_is_shipped_answers_every_row() -> None:
+    setting = Setting(profile=CPU, materials=Materials(), extractor=Sift(), photographs=7)
+    assert unanswered(setting) == {}
+    another = Materials(ldp_network=Asset(str(ASSETS / "inversion-none.safetensors")))
+    assert len(unanswered(replace(setting, materials=another))) == 16
 
 
 @pytest.mark.parametrize("name", ["figures", "figure-inlier"])

@@ -1,9 +1,9 @@
 """Rebuilds what `bench/assets` ships from a folder with `train/`, `tune.txt` and `test.txt`. Takes hours, resumes.
 
 The photographs of `train/` that are in neither list are parted by name into three thirds. The dictionary is made from the first
-two thirds, the attacker's public database from the last. Two more dictionaries, each made from another two thirds, quantise the
-photographs that the shipped dictionary was made from while networks are trained; they are not shipped. All networks start from
-one that was trained on raw descriptors, and are then trained equally long for their own releases.
+two thirds, the attacker's public database from the last. All networks start from one that was trained on raw descriptors of all
+photographs, at one rate and then at half of it. They are then trained equally long for their own releases, on the last third,
+which the dictionary does not know.
 """
 
 from __future__ import annotations
@@ -16,8 +16,7 @@ from bench.cli import main as bench
 from bench.public import ASSETS
 
 WORDS, PUBLIC_WORDS = 256_000, 128_000
-# As the shipped networks were trained. The one for LDP-Feat knows the whole dictionary and reads sets in their order.
-DEFENSES = {"none": ["none"], "affine": ["affine"], "ldp": ["ldp:words=0", "--encoding", "released"]}
+DEFENSES = ("none", "affine", "ldp")
 NARROW = "32,64,128,192,192"  # channels of the network for positions, so that all files together stay small
 
 
@@ -26,26 +25,26 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--work", type=Path, required=True, help="kept between runs; what is done is not done again")
     parser.add_argument(
-        "--steps", type=int, default=1000, help="of each network's own training; the common start has four times as many"
+        "--steps", type=int, default=1000, help="of the common start's last part; the first has four times as many"
     )
     args = parser.parse_args()
     folders = part(args.data, args.work / "photographs")
-    dictionaries = {name: args.work / f"{name}.safetensors" for name in ("01", "02", "12", "2")}
-    for name, file in dictionaries.items():
-        if not file.is_file():
-            run("dictionary", "build", "--images", folders[name], "--size", PUBLIC_WORDS if name == "2" else WORDS, "--out", file)
-    shutil.copyfile(dictionaries["01"], ASSETS / "dictionary.safetensors")
-    shutil.copyfile(dictionaries["2"], ASSETS / "public-database.safetensors")
-    given = ["--images", folders["012"], "--validation", folders["tune"]]
-    start = args.work / "start.safetensors"
+    for file, photographs, words in (("dictionary", "01", WORDS), ("public-database", "2", PUBLIC_WORDS)):
+        made = args.work / f"{file}.safetensors"
+        if not made.is_file():
+            run("dictionary", "build", "--images", folders[photographs], "--size", words, "--out", made)
+        shutil.copyfile(made, ASSETS / made.name)
+    unseen = ["--validation", folders["tune"]]
+    given = ["--images", folders["012"], *unseen]
+    first, start = args.work / "first.safetensors", args.work / "start.safetensors"
     if not start.is_file():
-        run("train", "--defense", "none", *given, "--steps", 4 * args.steps, "--out", start)
-    for name, defense in DEFENSES.items():
+        run("train", "--defense", "none", *given, "--steps", 4 * args.steps, "--out", first)
+        run("train", "--defense", "none", *given, "--start", first, "--steps", args.steps, "--rate", 1e-3, "--out", start)
+    for name in DEFENSES:
         network = args.work / f"inversion-{name}.safetensors"
         if not network.is_file():
-            crossfit = ["--crossfit", dictionaries["02"], "--crossfit", dictionaries["12"]]
-            further = ["--start", start, "--steps", args.steps, "--rate", 1e-3]
-            run("train", "--defense", *defense, *given, *crossfit, *further, "--out", network)
+            own = ["--images", folders["2"], *unseen, "--start", start, "--steps", 6 * args.steps // 10, "--rate", 1e-3]
+            run("train", "--defense", name, *own, "--out", network)
         shutil.copyfile(network, ASSETS / network.name)
     positions = args.work / "positions.safetensors"
     if not positions.is_file():
@@ -58,10 +57,7 @@ def part(data: Path, work: Path) -> dict[str, Path]:
     """Folders of links to the photographs of each set: unions of thirds named by their digits, and `tune`."""
     tune, test = (set((data / f"{name}.txt").read_text().split()) for name in ("tune", "test"))
     names = sorted(path.name for path in (data / "train").iterdir() if path.name not in tune | test)
-    sets = {
-        digits: [name for number, name in enumerate(names) if str(number % 3) in digits]
-        for digits in ("01", "02", "12", "2", "012")
-    }
+    sets = {digits: [name for number, name in enumerate(names) if str(number % 3) in digits] for digits in ("01", "2", "012")}
     folders = {}
     for name, members in {**sets, "tune": sorted(tune)}.items():
         folders[name] = work / name

@@ -18,6 +18,7 @@ from bench.plugin import Between, Defense, Extractor, OneOf
 from bench.public import Public
 
 KIND = "inversion-network"
+TOLD = ("defense", "encoding", "extractor", "serves", "shape", "slots")  # what metadata must say for a network to be used
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +50,7 @@ def load(path: Path) -> Network:
     Raises
     ------
     UserError
-        if the file is damaged, or its tensors are not those of the network that it describes.
+        if the file is damaged, says too little of itself, or its tensors are not those of the network that it describes.
     """
     status = path.stat() if path.is_file() else None
     return _load(path, status and (status.st_mtime_ns, status.st_size))
@@ -58,6 +59,9 @@ def load(path: Path) -> Network:
 @functools.lru_cache(maxsize=8)
 def _load(path: Path, version: object) -> Network:
     arrays, meta, digest = tensorfile.load(path, KIND)
+    missing = [what for what in TOLD if what not in meta]
+    if missing:
+        raise UserError(f"{path}: its metadata do not say {', '.join(missing)}; `bench train` makes a network whose do")
     wrong = sorted({str(array.dtype) for array in arrays.values()} - {"float16", "float32"})
     if wrong:
         raise UserError(f"{path}: weights are {', '.join(wrong)}, expected float16 or float32")
