@@ -2,6 +2,9 @@
 
 The paper's supplement: what is static and in the map appears in the image, and what moves before it does not. It holds for any
 release that a server can localize, whatever it promises of one descriptor: the map tells the rest.
+
+Subspaces do not tell what a photograph looks like well enough to retrieve references by them, yet localize where they are matched
+with the right ones. So they are matched with all.
 """
 
 from __future__ import annotations
@@ -23,7 +26,7 @@ class Inlier(SelectiveAttack):
     accepts = (Descriptors, Subspaces, WordSets)
     needs = frozenset({Knowledge.MAP})
 
-    retrieved: int = 20  # references that a query is matched with
+    retrieved: int = 20  # references that a query is matched with; of subspaces, all
     trials: int = 30_000  # of RANSAC, at most
 
     def select(self, view: View, rng: np.random.Generator) -> Selection:
@@ -31,7 +34,8 @@ class Inlier(SelectiveAttack):
         matcher = matching.default(view.defense)
         if matcher is None:
             raise UnitError(f"nothing matches {type(view.release).__name__}")
-        references = server.seen_in(view.release, view.defense, self.retrieved)
+        count = len(server.place.references) if isinstance(view.release, Subspaces) else self.retrieved
+        references = server.seen_in(view.release, view.defense, count)
         seed = int(rng.integers(2**31))
         found = server.localize(view.release, view.defense, references, matcher, self.trials, seed)
         verified = np.zeros(len(found.correspondences), bool) if found.estimate is None else found.estimate.inliers

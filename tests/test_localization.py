@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from test_localization_mapping import KEPT, STRETCH, WALK
 
+from attacks.inlier import Inlier
 from bench import cache, cli, runner
 from bench.datasets import aachen, export, lists
 from bench.datasets.aachen import Aachen
@@ -127,6 +128,18 @@ def test_retrieval_by_what_was_released_needs_nothing_else(place: Path) -> None:
 def _retrieved(record: Record) -> list[str]:
     names: list[str] = record["estimates"]["retrieved"]
     return names
+
+
+def test_the_inlier_attack_verifies_whatever_the_server_can_localize(place: Path) -> None:
+    """Of subspaces all references are tried, for they do not tell which to retrieve; random words verify next to nothing."""
+    random = LDP(dictionary=Asset("references"), words=1000, epsilon=0.0)
+    found = runner.run([Undefended(), Affine(), random], [Inlier(retrieved=1, trials=3000)], dataset=Aachen(path=place))
+    verified: dict[str, list[int]] = {}
+    for record in found:
+        verified.setdefault(record["defense"]["name"], []).append(int(record["notes"][-1].split()[0]))
+    assert min(verified["none"]) > 40
+    assert np.mean(verified["affine"]) > np.mean(verified["none"])  # of one reference's points
+    assert max(verified["ldp"]) < 20
 
 
 # ---- controls
