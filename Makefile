@@ -19,6 +19,7 @@ lint: .venv/ready-to-test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/mypy tools
 
 smoke: .venv/ready # with three seeds, whose spread says what may be chance
 	for seed in 0 1 2; do $(BIN)/bench run $(SMOKE) --seed $$seed --out runs/smoke > /dev/null || exit; done

@@ -34,8 +34,10 @@ class Inlier(SelectiveAttack):
         matcher = matching.default(view.defense)
         if matcher is None:
             raise UnitError(f"nothing matches {type(view.release).__name__}")
-        count = len(server.place.references) if isinstance(view.release, Subspaces) else self.retrieved
-        references = server.seen_in(view.release, view.defense, count)
+        if isinstance(view.release, Subspaces):
+            references = np.arange(len(server.place.references))
+        else:
+            references = server.seen_in(view.release, view.defense, self.retrieved)
         seed = int(rng.integers(2**31))
         found = server.localize(view.release, view.defense, references, matcher, self.trials, seed)
         verified = np.zeros(len(found.correspondences), bool) if found.estimate is None else found.estimate.inliers

@@ -43,7 +43,7 @@ def train(views: list[PhotographView], unseen: list[PhotographView], out: Path, 
     defense, shape, public = LDP(), Shape(), Public()
     every = [*views, *unseen]
     dictionaries = fitting_dictionaries({view.photograph for view in every}, [defense.dictionary], public)
-    public = Public(quantise(every, dictionaries, public))
+    public = Public(quantise(every, dictionaries, [0], public))
     errors = {
         "training": quantisation_error(views, dictionaries, public),
         "validation": quantisation_error(unseen, dictionaries, public),

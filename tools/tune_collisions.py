@@ -10,9 +10,10 @@ Pr(no collision | success) − Pr(no collision | failure) (Youden 1950), average
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from tune_attacks import row, write
@@ -67,16 +68,15 @@ def measured(dim: int, sources: list[Source], count: int, progress: Progress) ->
     for number, source in enumerate(sources[:count]):
         secret = extractor.extract(photographs.read(source.path).pixels)
         lifted = defense.lifted(secret, public, np.random.default_rng([SEED, dim, number]))
-        others = population.without(source.name)
-        knowledge = {
+        knowledge: dict[Knowledge, Callable[[], Any]] = {
             Knowledge.PUBLIC_DATABASE: lambda: public.dictionary(attack.database),
-            Knowledge.OTHER_RELEASES: lambda others=others: others,
+            Knowledge.OTHER_RELEASES: partial(population.without, source.name),
         }
         seen = View(release=lifted.release, defense=defense, extractor=extractor, knowledge=knowledge)
         estimate = attack.recover(seen, np.random.default_rng(SEED))
         points = np.concatenate([secret.descriptors[:, None], words[lifted.words]], axis=1)  # (N, 1 + a, D)
         right = (points @ estimate[:, :, None])[:, :, 0].argmax(axis=1) == 0
-        shared = company(lifted.release, others(attack.others), defense.adversarial, attack.coverage)
+        shared = company(lifted.release, seen.know(Knowledge.OTHER_RELEASES)(attack.others), defense.adversarial, attack.coverage)
         progress.advance(note=f"dim {dim}, {shared.summary()}")
         yield right, nearest_that_meet(points.astype(np.float64), shared)
 
