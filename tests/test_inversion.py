@@ -14,10 +14,11 @@ from attacks.inversion.network import Inverter, Shape, paint
 from attacks.inversion.train import Training, check_quantisation, train
 from bench.cli import main
 from bench.datasets import photographs
+from bench.datasets.photographs import Source
 from bench.errors import UserError
 from bench.features import build, dictionary
 from bench.features.sift import Sift
-from bench.features.views import collect
+from bench.features.views import OnDemand, collect
 from bench.plugin import Asset, Between, OneOf
 from bench.public import Public
 from bench.types import Descriptors, Subspaces, WordSets
@@ -194,11 +195,11 @@ def test_a_resumed_training_is_the_same_training(defense, sources, tmp_path, mon
     # Interrupt the second one after its third step.
     advance, steps = module._Trainer._advance, []
 
-    def interrupted(self, points, pixels):
+    def interrupted(self, *given):
         if len(steps) == 4:
             raise KeyboardInterrupt
         steps.append(1)
-        return advance(self, points, pixels)
+        return advance(self, *given)
 
     monkeypatch.setattr(module._Trainer, "_advance", interrupted)
     with pytest.raises(KeyboardInterrupt):
@@ -210,6 +211,34 @@ def test_a_resumed_training_is_the_same_training(defense, sources, tmp_path, mon
     assert whole["validation"] == parts["validation"]
     other = train(defense, {}, out=tmp_path / "other.safetensors", **given | {"training": dataclasses.replace(TINY, seed=1)})
     assert other["validation"] != whole["validation"]  # negative control
+
+
+@pytest.mark.parametrize("defense", [Undefended(), LDP(epsilon=8, subset_size=2)])
+def test_views_made_on_demand_train_the_same_network(defense, sources, tmp_path, monkeypatch):
+    """What does not fit into memory is read again and again, and changes nothing."""
+    import attacks.inversion.train as module
+
+    defense = dataclasses.replace(defense, words=2000) if isinstance(defense, LDP) else defense
+    given = {"photographs": sources[:2], "validation": sources[2:4], "extractor": Sift(), "training": TINY, "widths": (8, 8)}
+    kept = train(defense, {}, out=tmp_path / "kept.safetensors", **given)
+    monkeypatch.setattr(module, "IN_MEMORY", 1)
+    made = train(defense, {}, out=tmp_path / "made.safetensors", **given)
+    assert made == kept
+    assert weights.load(tmp_path / "kept.safetensors").digest == weights.load(tmp_path / "made.safetensors").digest
+
+
+def test_views_on_demand_leave_out_what_cannot_be_read(sources, tmp_path, rng, capsys):
+    spoilt = Source("spoilt", tmp_path / "spoilt.png")
+    spoilt.path.write_bytes(b"no picture")
+    lazy, eager = OnDemand([spoilt, sources[0]], Sift()), collect([spoilt, sources[0]], Sift())
+    assert [len(lazy), len(lazy[::4]), len(list(lazy)), len(eager)] == [8, 2, 4, 4]
+    for one, other in zip(lazy, eager, strict=True):
+        assert one.photograph == other.photograph
+        assert np.array_equal(one.pixels, other.pixels)
+        assert np.array_equal(one.features.codes, other.features.codes)
+    assert data.Examples(lazy, Undefended(), {}, {}, Public()).draw(rng).pixels.shape == (256, 256, 3)
+    with pytest.raises(UserError, match="none of 100"):
+        data.Examples(lazy[:4], Undefended(), {}, {}, Public()).draw(rng)
 
 
 @pytest.mark.parametrize(("slots", "candidates"), [(1, 1), (3, 1), (4, 4)])
@@ -236,8 +265,8 @@ def test_training_learns(sources, tmp_path):
     losses = []
 
     class Watched(module._Trainer):
-        def _advance(self, points, pixels):
-            losses.append(super()._advance(points, pixels))
+        def _advance(self, *given):
+            losses.append(super()._advance(*given))
             return losses[-1]
 
     original, module._Trainer = module._Trainer, Watched

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 
 from attacks.inversion.encoding import condition
 from bench.datasets.photographs import SIDE
-from bench.errors import UserError
+from bench.errors import UnitError, UserError
 from bench.features.dictionary import Dictionary
 from bench.features.views import PhotographView
 from bench.kernels.rows import row_keys
@@ -48,8 +49,19 @@ class Examples:
     public: Public
 
     def draw(self, rng: np.random.Generator) -> Example:
-        """A random crop of a random view under random served settings."""
-        view = self.views[int(rng.integers(len(self.views)))]
+        """A random crop of a random view under random served settings.
+
+        Raises
+        ------
+        UserError
+            if no view out of 100 can be used.
+        """
+        for _ in range(100):
+            with suppress(UnitError):  # of photographs that are read on demand, for others have been read already
+                view = self.views[int(rng.integers(len(self.views)))]
+                break
+        else:
+            raise UserError("none of 100 photographs could be used")
         pixels, secret = random_crop(view, rng)
         return self._release(view.photograph, pixels, secret, rng)
 

@@ -17,6 +17,8 @@ from torch import Tensor, nn
 from attacks.inversion.encoding import CELL, Points
 from bench.device import pick_dtype
 
+COARSENET = (256, 256, 256, 512, 512, 512)  # its encoder's channels (Pittaluga et al., CVPR 2019)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Shape:

@@ -1,12 +1,16 @@
 """Trains the network that an attacker would, for the releases of one defense.
 
-The data of a step are a function of (seed, step) alone, so that a resumed training is the same training.
+Each example of a step is a function of (seed, step, place in the batch) alone, so that a resumed training is the same training,
+and several processes make one batch.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
+import os
 import time
+from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -15,19 +19,20 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from attacks.inversion import weights
 from attacks.inversion.data import Example, Examples, Served, fitting_dictionaries, quantisation_error, quantise
 from attacks.inversion.encoding import Encoding, Points, encode, stack
 from attacks.inversion.log import Log
 from attacks.inversion.loss import reconstruction_loss, ssim
-from attacks.inversion.network import Inverter, Shape, paint
+from attacks.inversion.network import COARSENET, Inverter, Shape, paint
+from attacks.inversion.team import Team, launch
 from bench import tensorfile
-from bench.datasets.photographs import SIDE, Source
+from bench.datasets.photographs import Source
 from bench.device import pick_device, pick_dtype
 from bench.errors import UserError
-from bench.features.views import PhotographView, collect
+from bench.features.views import OnDemand, PhotographView, collect, photographs_of
 from bench.plugin import Asset, Defense, Extractor, OneOf
 from bench.progress import Progress
 from bench.public import Public
@@ -36,6 +41,8 @@ from bench.types import WordSets
 CHECKPOINT = "inversion-checkpoint"
 CHECKPOINT_EVERY = 250  # steps
 VALIDATE_AT_MOST = 100  # photographs
+IN_MEMORY = 2000  # photographs, about 6 GB; of more, views are made whenever they are needed
+COMPARED = 1000  # training photographs, at most, whose quantisation error is compared with that on unseen ones
 TOLERANCE = 0.05  # between the quantisation errors on training and on unseen photographs
 
 
@@ -56,6 +63,21 @@ class Training:
             raise UserError(f"training needs at least one step of one photograph, got {self.steps} of {self.batch}")
 
 
+@dataclass(frozen=True, kw_only=True)
+class Profile:
+    """The sizes of a network and of its training."""
+
+    widths: tuple[int, ...] = Shape.widths
+    training: Training = Training()  # frozen
+
+
+PROFILES = {
+    "cpu": Profile(),
+    # The paper's network and about as many photographs as it had, each seen 40 times: days of a GPU.
+    "paper": Profile(widths=COARSENET, training=Training(steps=125_000, batch=32, rate=1e-3, warmup=1000, average=0.9998)),
+}
+
+
 def train(
     defense: Defense,
     served: Served,
@@ -70,6 +92,7 @@ def train(
     widths: tuple[int, ...] = Shape.widths,
     training: Training = Training(),  # frozen
     log: Path | None = None,
+    devices: int = 1,
 ) -> dict[str, Any]:
     """Train, or resume, a network for the releases of `defense`, and return its metadata. What is done is not done again.
 
@@ -84,21 +107,59 @@ def train(
     encoding : what the network is told of a keypoint
     widths : of the network's levels
     log : folder for TensorBoard: loss, rate and speed of each step, and the validation's scores
+    devices : how many share each batch; what comes out is the same but for rounding
 
     Raises
     ------
     UserError
-        if photographs are in both sets, no photograph can be used, or `out` or its checkpoint is of another training; or
-        there is to be a log, and tensorboard is not installed.
+        if photographs are in both sets, no photograph can be used, or `out` or its checkpoint is of another training; there
+        is to be a log, and tensorboard is not installed; or there are too few devices.
     """
-    written = Log(log)
+    return launch(
+        devices,
+        training.batch,
+        _train,
+        defense,
+        served,
+        photographs=photographs,
+        validation=validation,
+        out=out,
+        extractor=extractor,
+        crossfit=crossfit,
+        start=start,
+        encoding=encoding,
+        widths=widths,
+        training=training,
+        log=log,
+    )
+
+
+def _train(
+    team: Team,
+    defense: Defense,
+    served: Served,
+    *,
+    photographs: Sequence[Source],
+    validation: Sequence[Source],
+    out: Path,
+    extractor: Extractor,
+    crossfit: Sequence[Asset],
+    start: Path | None,
+    encoding: Encoding,
+    widths: tuple[int, ...],
+    training: Training,
+    log: Path | None,
+) -> dict[str, Any]:
+    """One process's share of `train`."""
+    written = Log(log if team.leads else None)
     shared = {source.content_hash() for source in photographs} & {source.content_hash() for source in validation}
     if shared:
         raise UserError(f"{len(shared)} photographs are in both the training and the validation set")
-    views, unseen = collect(list(photographs), extractor), collect(list(validation), extractor)
-    unseen = [view for view in unseen if len(view.pixels) == SIDE][::2]  # not the mirrored ones
+    few = len(photographs) <= IN_MEMORY
+    views = collect(list(photographs), extractor) if few else OnDemand(photographs, extractor)
+    unseen = collect(list(validation), extractor)[::4]  # as they are, at 256 pixels
     examples, held_out, errors = _examples(defense, served, views, unseen, crossfit)
-    slots, length = _stacked(defense, examples, views[0], encoding)
+    slots, length = _stacked(defense, held_out, unseen[0], encoding)
     sample = encode([(first := held_out.whole(unseen[0], np.random.default_rng(0))).release], [first.condition], slots, encoding)
     one_by_one = slots if encoding == "invariant" and defense.releases is WordSets else 0
     shape = Shape(inputs=sample.values.shape[1], candidates=one_by_one, length=length, widths=widths)
@@ -107,7 +168,7 @@ def train(
         "encoding": encoding,
         "slots": slots,
         "start": None if start is None else weights.load(start).digest,
-        "photographs": len({view.photograph for view in views}),
+        "photographs": len(photographs_of(views)),
         "crops": training.steps * training.batch,
         "batch": training.batch,
         "rate": training.rate,
@@ -118,11 +179,13 @@ def train(
         done = weights.load(out).meta
         _same_training(out, done, meta)
         return done
-    trainer = _Trainer(shape, training, out, meta, written)
+    trainer = _Trainer(team, shape, training, out, meta, written)
     if start is not None and trainer.step == 0:
         read_as_descriptors = slots if defense.releases is WordSets and not one_by_one else 1
         trainer.start_from(weights.load(start).module, read_as_descriptors)
     module = trainer.run(examples)
+    if not team.leads:
+        return meta
     meta["validation"] = validate(module, held_out, unseen[:VALIDATE_AT_MOST], slots, encoding)
     written.scalars({f"validation/{name}": value for name, value in meta["validation"].items()}, training.steps)
     written.close()
@@ -139,21 +202,21 @@ def _same_training(path: Path, found: Mapping[str, Any], wanted: Mapping[str, An
 
 
 def _examples(
-    defense: Defense, served: Served, views: list[PhotographView], unseen: list[PhotographView], crossfit: Sequence[Asset]
+    defense: Defense, served: Served, views: Sequence[PhotographView], unseen: list[PhotographView], crossfit: Sequence[Asset]
 ) -> tuple[Examples, Examples, dict[str, float] | None]:
     """Training and validation examples, and the quantisation error on both where descriptors are quantised."""
     if defense.quantised_by is None:
         return Examples(views, defense, served, {}, Public()), Examples(unseen, defense, served, {}, Public()), None
     own = Asset(getattr(defense, defense.quantised_by))
     plain = Public()
-    chosen = fitting_dictionaries({view.photograph for view in views}, [own, *crossfit], plain)
-    chosen_unseen = fitting_dictionaries({view.photograph for view in unseen}, [own], plain)
+    chosen = fitting_dictionaries(photographs_of(views), [own, *crossfit], plain)
+    chosen_unseen = fitting_dictionaries(photographs_of(unseen), [own], plain)
     sizes = _sizes(defense, served)
-    public = Public(quantise(views, chosen, sizes, plain), remembered=0)
+    public = plain if isinstance(views, OnDemand) else Public(quantise(views, chosen, sizes, plain), remembered=0)
     examples, held_out = Examples(views, defense, served, chosen, public), Examples(unseen, defense, served, chosen_unseen, plain)
-    upright = [view for view in views if len(view.pixels) == SIDE][::2]
+    compared = views[:: 4 * math.ceil(len(views) / (4 * COMPARED))]  # as they are, at 256 pixels
     errors = {
-        "training": quantisation_error(upright, chosen, public, sizes[0]),
+        "training": quantisation_error(compared, chosen, public, sizes[0]),
         "validation": quantisation_error(unseen, chosen_unseen, plain, sizes[0]),
     }
     check_quantisation(errors["training"], errors["validation"])
@@ -201,9 +264,9 @@ def _checkpoint_path(out: Path) -> Path:
 class _Trainer:
     """Weights, their moving average, AdamW's state and the number of steps done: what a checkpoint holds."""
 
-    def __init__(self, shape: Shape, training: Training, out: Path, meta: dict[str, Any], log: Log) -> None:
+    def __init__(self, team: Team, shape: Shape, training: Training, out: Path, meta: dict[str, Any], log: Log) -> None:
         torch.manual_seed(training.seed)
-        self.training, self.meta, self.log = training, meta, log
+        self.team, self.training, self.meta, self.log = team, training, meta, log
         self.device = pick_device()
         self.dtype = pick_dtype(self.device)
         self.path = _checkpoint_path(out)
@@ -225,8 +288,9 @@ class _Trainer:
             return self._averaged()
         with Progress("training", self.training.steps - self.step) as progress:
             started, before, smooth = time.monotonic(), self.step, math.nan
-            for points, photographs in _batches(examples, self.meta["slots"], self.meta["encoding"], self.training, self.step):
-                loss = self._advance(points.to(self.device), photographs.to(self.device))
+            shared = self.team.share(self.module)
+            for points, photographs in self._batches(examples):
+                loss = self._advance(shared, points.to(self.device), photographs.to(self.device))
                 smooth = loss if math.isnan(smooth) else 0.98 * smooth + 0.02 * loss
                 speed = (self.step - before) * self.training.batch / (time.monotonic() - started)
                 self.log.scalars({"loss": loss, "rate": self.optimizer.param_groups[0]["lr"], "images/s": speed}, self.step)
@@ -236,7 +300,24 @@ class _Trainer:
         self._save()
         return self._averaged()
 
-    def _advance(self, points: Points, photographs: Tensor) -> float:
+    def _batches(self, examples: Examples) -> Iterator[tuple[Points, Tensor]]:
+        """This process's parts of the batches from the next step on, some being made while one is used."""
+        training, places = self.training, self.team.part(self.training.batch)
+
+        def make(step: int) -> tuple[Points, Tensor]:
+            drawn = [examples.draw(np.random.default_rng([training.seed, step, place])) for place in places]
+            return to_batch(drawn, self.meta["slots"], self.meta["encoding"])
+
+        workers = max(1, (os.cpu_count() or 1) // self.team.size) if isinstance(examples.views, OnDemand) else 1
+        with ThreadPoolExecutor(workers) as ahead:
+            steps = iter(range(self.step, training.steps))
+            coming = deque(ahead.submit(make, step) for step in itertools.islice(steps, workers))
+            while coming:
+                ready = coming.popleft().result()
+                coming.extend(ahead.submit(make, step) for step in itertools.islice(steps, 1))
+                yield ready
+
+    def _advance(self, shared: nn.Module, points: Points, photographs: Tensor) -> float:
         """One step of AdamW."""
         warm, done = self.training.warmup, self.step
         progress = (done - warm) / max(1, self.training.steps - warm)
@@ -245,7 +326,7 @@ class _Trainer:
             group["lr"] = self.training.rate * factor
         self.module.train()
         with torch.autocast(self.device.type, self.dtype, enabled=self.dtype != torch.float32):
-            painted = self.module(points)
+            painted = shared(points)
         loss = reconstruction_loss(painted, photographs)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
@@ -256,7 +337,7 @@ class _Trainer:
         for name, weight in self.module.state_dict().items():
             if weight.is_floating_point():
                 self.average[name].lerp_(weight, 1 - keep)
-        value = float(loss.detach())
+        value = self.team.mean(loss.detach())
         if not math.isfinite(value):
             raise FloatingPointError(f"the loss is {value} at step {self.step}")
         return value
@@ -266,6 +347,8 @@ class _Trainer:
         return self.module.eval()
 
     def _save(self) -> None:
+        if not self.team.leads:
+            return
         arrays = {f"weights/{name}": value.cpu().numpy() for name, value in self.module.state_dict().items()}
         arrays |= {f"average/{name}": value.cpu().numpy() for name, value in self.average.items()}
         for index, state in self.optimizer.state_dict()["state"].items():
@@ -285,24 +368,6 @@ class _Trainer:
             for index in range(len(list(self.module.parameters())))
         }
         self.optimizer.load_state_dict(state)
-
-
-def _batches(
-    examples: Examples, slots: int, encoding: Encoding, training: Training, start: int
-) -> Iterator[tuple[Points, Tensor]]:
-    """Batches from step `start` on, the next being made while one is used."""
-
-    def make(step: int) -> tuple[Points, Tensor]:
-        rng = np.random.default_rng([training.seed, step])
-        return to_batch([examples.draw(rng) for _ in range(training.batch)], slots, encoding)
-
-    with ThreadPoolExecutor(1) as ahead:
-        upcoming = ahead.submit(make, start)
-        for step in range(start, training.steps):
-            ready = upcoming.result()
-            if step + 1 < training.steps:
-                upcoming = ahead.submit(make, step + 1)
-            yield ready
 
 
 def to_batch(examples: Sequence[Example], slots: int, encoding: Encoding) -> tuple[Points, Tensor]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,8 @@ def options(parser: argparse.ArgumentParser) -> None:
         default="invariant",
         help="what the network is told: the release without random order or basis, as it is, or positions alone",
     )
+    parser.add_argument("--profile", choices=("cpu", "paper"), default="cpu", help="sizes, where no other option gives them")
+    parser.add_argument("--devices", type=whole, default=1, metavar="N", help="GPUs, or CPU processes, that share each batch")
     parser.add_argument("--widths", type=wholes, metavar="N,N,...", help="channels of the network's levels")
     parser.add_argument("--start", type=Path, metavar="FILE", help="weights of a network for raw descriptors to start from")
     parser.add_argument("--rate", type=float, metavar="R", help="the learning rate at its peak")
@@ -47,8 +50,7 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 def execute(args: argparse.Namespace) -> int:
     from attacks.inversion import kept
-    from attacks.inversion.network import Shape
-    from attacks.inversion.train import Training, train
+    from attacks.inversion.train import PROFILES, train
     from bench import registry, spec
     from bench.datasets.photographs import folder, held_out
     from bench.plugin import Asset
@@ -57,6 +59,7 @@ def execute(args: argparse.Namespace) -> int:
     defense = spec.build(plugin, given)
     served = {name: settings for name, settings in plugin.serves.items() if name not in given}
     photographs, validation = held_out(folder(args.images), args.validation)
+    profile = PROFILES[args.profile]
     chosen = {name: value for name in ("steps", "batch", "rate", "seed") if (value := getattr(args, name)) is not None}
     asked: dict[str, Any] = {
         "photographs": photographs,
@@ -65,13 +68,13 @@ def execute(args: argparse.Namespace) -> int:
         "crossfit": [Asset(file) for file in args.crossfit],
         "start": args.start,
         "encoding": args.encoding,
-        "widths": args.widths or Shape.widths,
-        "training": Training(**chosen),
+        "widths": args.widths or profile.widths,
+        "training": dataclasses.replace(profile.training, **chosen),
     }
     key = kept.key(defense, served, **asked)
     meta = kept.fetch(key, args.out)
     if meta is None:
-        meta = train(defense, served, out=args.out, log=args.log, **asked)
+        meta = train(defense, served, out=args.out, log=args.log, devices=args.devices, **asked)
         kept.keep(key, args.out)
     scores = ", ".join(f"{name} {value:.4g}" for name, value in meta["validation"].items())
     print(f"{args.out}: {meta['crops']} crops of {meta['photographs']} photographs; validation: {scores}")

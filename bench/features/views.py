@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import functools
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from typing import overload
 
 import numpy as np
+from PIL import Image
 
 from bench.datasets.photographs import Source, decode, square
 from bench.errors import UnitError, UserError
@@ -14,6 +18,7 @@ from bench.progress import Progress
 from bench.types import Bytes, Features
 
 SIDES = (256, 320)  # pixels
+KINDS = [(side, mirrored) for side in SIDES for mirrored in (False, True)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,10 +40,64 @@ def views(source: Source, extractor: Extractor) -> Iterator[PhotographView]:
     """
     image, _ = decode(source.path)
     photograph = source.content_hash()
-    for side in SIDES:
-        pixels = square(image, side)
-        for seen in (pixels, np.ascontiguousarray(pixels[:, ::-1])):
-            yield PhotographView(photograph, seen, extractor.extract(seen, source.path))
+    for kind in KINDS:
+        yield _view(image, photograph, kind, source, extractor)
+
+
+def _view(image: Image.Image, photograph: str, kind: tuple[int, bool], source: Source, extractor: Extractor) -> PhotographView:
+    side, mirrored = kind
+    pixels = square(image, side)
+    if mirrored:
+        pixels = np.ascontiguousarray(pixels[:, ::-1])
+    return PhotographView(photograph, pixels, extractor.extract(pixels, source.path))
+
+
+class OnDemand(Sequence[PhotographView]):
+    """The same views of more photographs than memory holds, in the same order, each made whenever it is asked for.
+
+    Iterating leaves out those that cannot be made.
+    """
+
+    def __init__(self, sources: Sequence[Source], extractor: Extractor) -> None:
+        self._extractor = extractor
+        self._which = [(source, kind) for source in sources for kind in KINDS]
+
+    @functools.cached_property
+    def photographs(self) -> set[str]:
+        """Content hashes, for which every photograph is read once."""
+        return {source.content_hash() for source in {source for source, _ in self._which}}
+
+    def __len__(self) -> int:
+        return len(self._which)
+
+    @overload
+    def __getitem__(self, place: int) -> PhotographView: ...
+    @overload
+    def __getitem__(self, place: slice) -> OnDemand: ...
+    def __getitem__(self, place: int | slice) -> PhotographView | OnDemand:
+        """One view, or some of them, still to be made.
+
+        Raises
+        ------
+        UnitError
+            if the photograph cannot be read or has no keypoint.
+        """
+        if isinstance(place, slice):
+            some = OnDemand((), self._extractor)
+            some._which = self._which[place]
+            return some
+        source, kind = self._which[place]
+        return _view(decode(source.path)[0], source.content_hash(), kind, source, self._extractor)
+
+    def __iter__(self) -> Iterator[PhotographView]:
+        for place in range(len(self)):
+            with suppress(UnitError):
+                yield self[place]
+
+
+def photographs_of(some: Sequence[PhotographView]) -> set[str]:
+    """The content hashes of their photographs."""
+    return some.photographs if isinstance(some, OnDemand) else {view.photograph for view in some}
 
 
 def collect(sources: list[Source], extractor: Extractor) -> list[PhotographView]:

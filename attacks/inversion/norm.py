@@ -1,0 +1,57 @@
+"""Batch norm over a batch that several processes share. PyTorch's own, `SyncBatchNorm`, does so on GPUs alone."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor, distributed, nn
+
+
+class JointBatchNorm2d(nn.BatchNorm2d):
+    """Normalises by mean and variance over the equal parts of all processes. (B, C, H, W) -> the same."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        if not self.training:
+            return super().forward(x)
+        wide = x if x.dtype == torch.float64 else x.float()  # sums over a batch are too long for half precision
+        processes = distributed.get_world_size()
+        moments = torch.stack([wide.mean(dim=(0, 2, 3)), wide.square().mean(dim=(0, 2, 3))])  # (2, C)
+        mean, square = _Summed.apply(moments) / processes
+        variance = square - mean.square()
+        self._remember(mean.detach(), variance.detach(), x.numel() // x.shape[1] * processes)
+        scale = self.weight * torch.rsqrt(variance + self.eps)
+        shift = self.bias - mean * scale
+        return (wide * scale[:, None, None] + shift[:, None, None]).to(x.dtype)
+
+    @torch.no_grad()
+    def _remember(self, mean: Tensor, variance: Tensor, count: int) -> None:
+        """Move the running statistics as batch norm does, whose running variance is the unbiased one."""
+        assert self.running_mean is not None
+        assert self.running_var is not None
+        assert self.momentum is not None
+        assert self.num_batches_tracked is not None
+        self.num_batches_tracked += 1
+        self.running_mean.lerp_(mean, self.momentum)
+        self.running_var.lerp_(variance * (count / max(1, count - 1)), self.momentum)
+
+
+class _Summed(torch.autograd.Function):
+    """The sum of a tensor over all processes, every one of which has it and adds to its gradient."""
+
+    @staticmethod
+    def forward(context: Any, part: Tensor) -> Tensor:
+        whole = part.clone()
+        distributed.all_reduce(whole)
+        return whole
+
+    @staticmethod
+    def backward(context: Any, gradient: Tensor) -> Tensor:
+        return _Summed.forward(context, gradient)
+
+
+def joint(module: nn.Module) -> None:
+    """Make every batch norm of a module, in place, one over the batch of all processes."""
+    for inner in module.modules():
+        if type(inner) is nn.BatchNorm2d:
+            inner.__class__ = JointBatchNorm2d

@@ -1,0 +1,131 @@
+"""Training on several devices: what two processes compute is what one computes of the joint batch."""
+
+import os
+
+import numpy as np
+import pytest
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from torch import distributed, nn
+
+import attacks.inversion.train as inversion
+from attacks.inversion import norm, weights
+from attacks.inversion.team import Team, launch
+from attacks.inversion.train import PROFILES, Training
+from bench.cli import main
+from bench.datasets import photographs
+from bench.features.sift import Sift
+from defenses.none import Undefended
+
+pytestmark = pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="two processes need two cores")
+
+
+def normalised(module, images):
+    """Output, gradient of the input for a loss that is no mere sum, and running statistics."""
+    images = images.clone().requires_grad_()
+    painted = module(images)
+    (painted**3).sum().backward()
+    return painted.detach(), images.grad, module.running_mean, module.running_var, module.weight.grad
+
+
+def one_of_two(rank, folder, jointly):
+    distributed.init_process_group("gloo", init_method=f"file://{folder}/meet", rank=rank, world_size=2)
+    module = nn.Sequential(nn.BatchNorm2d(3, dtype=torch.float64))
+    if jointly:
+        norm.joint(module)
+    part = torch.load(folder / "images")[2 * rank : 2 * rank + 2]
+    torch.save(normalised(module[0], part), folder / f"found-{rank}")
+    distributed.destroy_process_group()
+
+
+@pytest.mark.parametrize("jointly", [True, False])
+def test_batch_norm_is_over_the_batch_of_both_processes(jointly, tmp_path):
+    """And PyTorch's own, over each process's part, is something else (negative control)."""
+    torch.manual_seed(0)
+    images = torch.randn(4, 3, 5, 6, dtype=torch.float64) + torch.arange(4)[:, None, None, None]
+    torch.save(images, tmp_path / "images")
+    torch.multiprocessing.spawn(one_of_two, (tmp_path, jointly), nprocs=2)
+    first, second = (torch.load(tmp_path / f"found-{rank}") for rank in range(2))
+    painted, gradient, mean, variance, scale = normalised(nn.BatchNorm2d(3, dtype=torch.float64), images)
+    together = [
+        (torch.cat([first[0], second[0]]), painted),
+        (torch.cat([first[1], second[1]]), gradient),
+        (first[2], mean),
+        (second[2], mean),
+        (first[3], variance),
+        (first[4] + second[4], scale),
+    ]
+    same = [torch.allclose(found, expected, rtol=1e-9, atol=1e-12) for found, expected in together]
+    assert all(same) if jointly else not any(same)
+
+
+def losses(folder):
+    events = EventAccumulator(str(folder))
+    events.Reload()
+    return np.array([event.value for event in events.Scalars("loss")])
+
+
+def in_single_precision(team, *args, **kwargs):
+    """Train without half-precision's rounding, which grows from step to step."""
+    inversion.pick_dtype = lambda device: torch.float32
+    return inversion._train(team, *args, **kwargs)
+
+
+def without_joint_norms(*args, **kwargs):
+    norm.joint = lambda module: None  # in a process of its own
+    return in_single_precision(*args, **kwargs)
+
+
+# AdamW's first steps are signs of gradients, which rounding turns where they are small: at a low rate it does little.
+SHORT = Training(steps=4, batch=4, warmup=2, rate=1e-4)
+PROCESSES = {"one": (1, in_single_precision), "two": (2, in_single_precision), "apart": (2, without_joint_norms)}
+
+
+def test_two_processes_train_as_one_with_the_joint_batch(tmp_path, monkeypatch):
+    """The same loss at every step, the same scores. Not so if each process normalises its own part (control)."""
+    monkeypatch.setattr(inversion, "pick_dtype", inversion.pick_dtype)  # to put it back
+    sources = photographs.builtin()
+    given = {"photographs": sources[:2], "validation": sources[2:3], "extractor": Sift(), "widths": (16, 16, 16)}
+    given |= {"crossfit": (), "start": None, "encoding": "invariant"}
+    found = {}
+    for name, (devices, how) in PROCESSES.items():
+        own = {"out": tmp_path / name, "training": SHORT, "log": tmp_path / f"log-{name}"}
+        meta = launch(devices, SHORT.batch, how, Undefended(), {}, **given, **own)
+        found[name] = losses(tmp_path / f"log-{name}"), meta["validation"]["ssim"]
+    assert len(found["two"][0]) == SHORT.steps
+    np.testing.assert_allclose(found["two"][0], found["one"][0], rtol=1e-5)
+    assert found["two"][1] == pytest.approx(found["one"][1], abs=1e-5)
+    assert np.abs(found["apart"][0] / found["one"][0] - 1).max() > 1e-4
+    one, two = (weights.load(tmp_path / name) for name in ("one", "two"))
+    assert one.meta.keys() == two.meta.keys()
+    assert not list(tmp_path.glob("*.checkpoint"))
+
+
+def test_a_users_mistake_in_a_process_is_told_in_one_line(tmp_path, capsys):
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    (folder / "a.png").write_bytes(photographs.builtin()[0].path.read_bytes())
+    command = ["train", "--defense", "none", "--images", str(folder), "--validation", str(folder), "--out", str(tmp_path / "W")]
+    assert main([*command, "--devices", "2"]) == 2
+    assert capsys.readouterr().err.splitlines()[-1].endswith("1 photographs are in both the training and the validation set")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"), [(("--devices", "4096"), "from 1 to"), (("--devices", "2", "--batch", "3"), "a multiple of 2")]
+)
+def test_devices_that_are_not_there_or_cannot_share(words, message, tmp_path, capsys):
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for source in photographs.builtin()[:2]:
+        (folder / source.path.name).write_bytes(source.path.read_bytes())
+    assert main(["train", "--defense", "none", "--images", str(folder), "--out", str(tmp_path / "W"), *words]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_parts_make_the_batch():
+    assert [place for rank in range(3) for place in Team(rank, 3).part(12)] == list(range(12))
+    assert list(Team().part(5)) == list(range(5))
+
+
+def test_the_papers_profile_has_coarsenets_widths():
+    assert PROFILES["paper"].widths == (256, 256, 256, 512, 512, 512)
