@@ -51,7 +51,7 @@ ELSEWHERE = {
         "run --task structure --defense none --defense ldp:words=256000,epsilon=9.307,subset_size=16 "
         "--extractor sift:max_keypoints=2000"
     ): "test_structure.py and test_reproduce.py, with fewer words",
-    "train --defense none --images megadepth/ --out W.safetensors --profile paper --devices 4": "test_team.py, with two processes",
+    "train --defense none --images megadepth/ --out W.safetensors --profile paper --devices 4": "test_team.py, on two CPUs",
     "sweep privacy-utility": "test_sweep.py plans it; it takes an hour",
     "run --defense my-defense --attack keypoints": "test_skeleton.py, with the package installed",
     "audit --defense ldp:epsilon=1/3,subset_size=1 --words 3 --trials 20000": "test_guarantee.py",

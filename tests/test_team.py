@@ -76,6 +76,19 @@ def without_joint_norms(*args, **kwargs):
     return in_single_precision(*args, **kwargs)
 
 
+def asked(folder, name):
+    """What `_train` is told."""
+    sources = photographs.builtin()
+    data = {"photographs": sources[:2], "validation": sources[2:3], "extractor": Sift(), "crossfit": (), "encoding": "invariant"}
+    return data | {
+        "widths": (16, 16, 16),
+        "training": SHORT,
+        "start": None,
+        "out": folder / name,
+        "log": folder / f"log-{name}",
+    }
+
+
 # AdamW's first steps are signs of gradients, which rounding turns where they are small: at a low rate it does little.
 SHORT = Training(steps=4, batch=4, warmup=2, rate=1e-4)
 PROCESSES = {"one": (1, in_single_precision), "two": (2, in_single_precision), "apart": (2, without_joint_norms)}
@@ -84,13 +97,9 @@ PROCESSES = {"one": (1, in_single_precision), "two": (2, in_single_precision), "
 def test_two_processes_train_as_one_with_the_joint_batch(tmp_path, monkeypatch):
     """The same loss at every step, the same scores. Not so if each process normalises its own part (control)."""
     monkeypatch.setattr(inversion, "pick_dtype", inversion.pick_dtype)  # to put it back
-    sources = photographs.builtin()
-    given = {"photographs": sources[:2], "validation": sources[2:3], "extractor": Sift(), "widths": (16, 16, 16)}
-    given |= {"crossfit": (), "start": None, "encoding": "invariant"}
     found = {}
     for name, (devices, how) in PROCESSES.items():
-        own = {"out": tmp_path / name, "training": SHORT, "log": tmp_path / f"log-{name}"}
-        meta = launch(devices, SHORT.batch, how, Undefended(), {}, **given, **own)
+        meta = launch(devices, SHORT.batch, how, Undefended(), {}, **asked(tmp_path, name))
         found[name] = losses(tmp_path / f"log-{name}"), meta["validation"]["ssim"]
     assert len(found["two"][0]) == SHORT.steps
     np.testing.assert_allclose(found["two"][0], found["one"][0], rtol=1e-5)
@@ -99,6 +108,25 @@ def test_two_processes_train_as_one_with_the_joint_batch(tmp_path, monkeypatch):
     one, two = (weights.load(tmp_path / name) for name in ("one", "two"))
     assert one.meta.keys() == two.meta.keys()
     assert not list(tmp_path.glob("*.checkpoint"))
+
+
+def test_two_processes_go_on_from_what_one_left(tmp_path, monkeypatch):
+    monkeypatch.setattr(inversion, "pick_dtype", inversion.pick_dtype)
+    monkeypatch.setattr(inversion, "CHECKPOINT_EVERY", 1)
+    advance = inversion._Trainer._advance
+
+    def interrupted(self, *given):
+        if self.step == 2:
+            raise KeyboardInterrupt
+        return advance(self, *given)
+
+    launch(1, SHORT.batch, in_single_precision, Undefended(), {}, **asked(tmp_path, "whole"))
+    monkeypatch.setattr(inversion._Trainer, "_advance", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        launch(1, SHORT.batch, in_single_precision, Undefended(), {}, **asked(tmp_path, "parts"))
+    launch(2, SHORT.batch, in_single_precision, Undefended(), {}, **asked(tmp_path, "parts"))
+    assert len(losses(tmp_path / "log-parts")) == SHORT.steps  # two steps of one, two of both
+    np.testing.assert_allclose(losses(tmp_path / "log-parts"), losses(tmp_path / "log-whole"), rtol=1e-5)
 
 
 def test_a_users_mistake_in_a_process_is_told_in_one_line(tmp_path, capsys):
