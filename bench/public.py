@@ -31,7 +31,7 @@ class Public:
     Parameters
     ----------
     quantiser : finds the nearest words of (N, D) rows in a dictionary
-    remembered : number of photographs whose quantisation is kept
+    remembered : number of photographs whose quantisation is kept; with 0, several threads may quantise at once
     known : dictionaries by name that are in no file
     place : what is served, where it is a place: the dictionary called `references` is made from its reference images
     """
@@ -94,6 +94,8 @@ class Public:
         queries = features.descriptors if features.codes is None else features.codes
         if queries.shape[1] != known.words.shape[1]:
             raise UserError(f"the descriptors have length {queries.shape[1]}, the words of {asset} {known.words.shape[1]}")
+        if not self._remembered:
+            return self._quantiser(known, queries)
         key = hashlib.sha256(known.digest.encode() + str(queries.dtype).encode() + queries.tobytes()).hexdigest()
         if key in self._quantised:
             self._quantised.move_to_end(key)

@@ -18,7 +18,7 @@ class JointBatchNorm2d(nn.BatchNorm2d):
         processes = distributed.get_world_size()
         moments = torch.stack([wide.mean(dim=(0, 2, 3)), wide.square().mean(dim=(0, 2, 3))])  # (2, C)
         mean, square = _Summed.apply(moments) / processes
-        variance = square - mean.square()
+        variance = (square - mean.square()).clamp(min=0)  # which rounding could make negative
         self._remember(mean.detach(), variance.detach(), x.numel() // x.shape[1] * processes)
         scale = self.weight * torch.rsqrt(variance + self.eps)
         shift = self.bias - mean * scale

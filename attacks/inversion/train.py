@@ -212,7 +212,7 @@ def _examples(
     chosen = fitting_dictionaries(photographs_of(views), [own, *crossfit], plain)
     chosen_unseen = fitting_dictionaries(photographs_of(unseen), [own], plain)
     sizes = _sizes(defense, served)
-    public = plain if isinstance(views, OnDemand) else Public(quantise(views, chosen, sizes, plain), remembered=0)
+    public = Public(remembered=0) if isinstance(views, OnDemand) else Public(quantise(views, chosen, sizes, plain), remembered=0)
     examples, held_out = Examples(views, defense, served, chosen, public), Examples(unseen, defense, served, chosen_unseen, plain)
     compared = views[:: 4 * math.ceil(len(views) / (4 * COMPARED))]  # as they are, at 256 pixels
     errors = {
