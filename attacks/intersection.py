@@ -31,8 +31,8 @@ class Intersection(DescriptorAttack):
     accepts = (Subspaces,)
     needs = frozenset({Knowledge.OTHER_RELEASES})
 
-    neighbours: int = 2048  # |V|: rebuilt words next nearest to the subspace
-    estimators: int = 4  # |U|: those of them that the estimate is made of
+    neighbours: int = 1024  # |V|: rebuilt words next nearest to the subspace
+    estimators: int = 2  # |U|: those of them that the estimate is made of
     coverage: float = 0.95  # releases are asked for until this share of the photograph's words is met
     others: int = 800  # c: releases of other photographs that there are to ask for
 
