@@ -37,7 +37,7 @@ class Collisions(Task):
 
     coverage: float = 0.95  # releases are asked for until this share of the photograph's words is met
     others: int = 800  # releases of other photographs that there are to ask for
-    tolerance: float = 0.1  # τ, a distance of unit descriptors
+    tolerance: float = 0.3  # τ, a distance of unit descriptors
 
     def __post_init__(self) -> None:
         if not 0 <= self.coverage <= 1:
