@@ -314,6 +314,10 @@ class Extractor(Plugin, ABC):
             if there is no keypoint.
         """
 
+    def mirror_order(self) -> Indices | None:
+        """The order in which a descriptor's components are those of the mirrored photograph's, (D,); None if there is none."""
+        return None
+
     def unlimited(self) -> Extractor:
         """The same without its limit on the number of keypoints, if it has one: for dictionaries, which are made of many."""
         return self

@@ -122,7 +122,7 @@ class Up(nn.Module):
 
 
 @torch.inference_mode()
-def paint(module: Inverter, points: Points) -> Tensor:
+def paint(module: nn.Module, points: Points) -> Tensor:
     """What an attacker shows: -> (B, 3, H, W) float32 in [0, 1]. Deterministic on one machine with one number of threads."""
     device = next(module.parameters()).device
     dtype = pick_dtype(device)

@@ -12,7 +12,7 @@ import numpy as np
 from bench.errors import UnitError, UserError
 from bench.kernels.search import unit_rows
 from bench.plugin import Extractor
-from bench.types import Features
+from bench.types import Features, Indices
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,6 +59,16 @@ class Sift(Extractor):
             keypoints=xy[keep], descriptors=unit_rows(codes[keep]), codes=codes[keep], size=(width, height), frames=frames[keep]
         )
         return found.by_position()
+
+    def mirror_order(self) -> Indices:
+        """Upright: columns of the 4 x 4 histograms change places, and angle a becomes π - a. Oriented: rows, and -a."""
+        row, column, angle = np.indices((4, 4, 8))
+        if self.upright:
+            column, angle = 3 - column, (4 - angle) % 8
+        else:  # the frame turns with the photograph
+            row, angle = 3 - row, -angle % 8
+        order: Indices = ((row * 4 + column) * 8 + angle).ravel()
+        return order
 
     def unlimited(self) -> Extractor:
         return replace(self, max_keypoints=sys.maxsize)
