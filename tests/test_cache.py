@@ -18,7 +18,7 @@ from fakes import FAKES, album, install
 
 from attacks.inversion import kept as networks
 from attacks.inversion import weights
-from attacks.inversion.train import Training
+from attacks.inversion.plan import Plan, Training
 from attacks.sparsity import Sparsity
 from bench import cache, cli, provenance, recovery, runner, tensorfile
 from bench.datasets.photographs import folder
@@ -211,17 +211,16 @@ def test_protecting_for_real_leaves_no_trace(images: Path, small: Asset) -> None
 
 
 def test_network_is_found_again_by_what_made_it(images: Path, tmp_path: Path) -> None:
-    asked: dict[str, Any] = {
-        "photographs": folder(images)[:1],
-        "validation": folder(images)[1:],
-        "extractor": Sift(),
-        "crossfit": [],
-        "start": None,
-        "encoding": "invariant",
-        "widths": (8, 8),
-        "training": Training(steps=1),
-    }
-    key = networks.key(Undefended(), {}, **asked)
+    plan = Plan(
+        defense=Undefended(),
+        served={},
+        photographs=folder(images)[:1],
+        validation=folder(images)[1:],
+        extractor=Sift(),
+        widths=(8, 8),
+        training=Training(steps=1),
+    )
+    key = networks.key(plan)
     out = tmp_path / "W.safetensors"
     assert networks.fetch(key, out) is None
     shipped = sorted(ASSETS.glob("inversion-*.safetensors"))
@@ -231,9 +230,9 @@ def test_network_is_found_again_by_what_made_it(images: Path, tmp_path: Path) ->
     assert networks.fetch(key, out) == weights.load(shipped[0]).meta
     assert out.read_bytes() == shipped[0].read_bytes()
     assert networks.fetch(key, out) is None  # what is there is not overwritten
-    for field, value in {"training": Training(steps=2), "widths": (8, 9), "photographs": folder(images)[1:]}.items():
-        assert networks.key(Undefended(), {}, **asked | {field: value}) != key
-    assert networks.key(Affine(), {}, **asked) != key
+    others: dict[str, Any] = {"training": Training(steps=2), "widths": (8, 9), "photographs": folder(images)[1:]}
+    for field, value in {**others, "defense": Affine()}.items():
+        assert networks.key(dataclasses.replace(plan, **{field: value})) != key
 
 
 # ---- source

@@ -10,7 +10,8 @@ import torch
 import torch.nn.functional as nnf
 
 from attacks.context import Context
-from attacks.inversion.train import Training, check_quantisation
+from attacks.inversion.plan import Training
+from attacks.inversion.train import check_quantisation
 from attacks.surroundings import weights
 from attacks.surroundings.network import Shape, Surroundings, propagate, shares
 from attacks.surroundings.scenes import CERTAIN, log_odds, nearest_keypoints, scene

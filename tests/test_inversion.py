@@ -11,7 +11,8 @@ from attacks.inversion import data, weights
 from attacks.inversion.encoding import Points, condition, encode, stack
 from attacks.inversion.loss import reconstruction_loss, ssim
 from attacks.inversion.network import Inverter, Shape, paint
-from attacks.inversion.train import Training, check_quantisation, train
+from attacks.inversion.plan import Plan, Training
+from attacks.inversion.train import check_quantisation, train
 from bench.cli import main
 from bench.datasets import photographs
 from bench.datasets.photographs import Source
@@ -185,13 +186,19 @@ def test_loss_of_the_truth_is_zero(rng):
     assert float(reconstruction_loss(1 - image, image)) > 0.1
 
 
+def of_two(sources, **given):
+    """A training on two photographs, validated on a third."""
+    data = {"photographs": sources[:2], "validation": sources[2:3], "extractor": Sift()}
+    return Plan(**{"defense": Undefended(), "served": {}} | data | given)
+
+
 @pytest.mark.parametrize("defense", [Undefended(), Affine(lifting="random", dim=2)])
 def test_a_resumed_training_is_the_same_training(defense, sources, tmp_path, monkeypatch):
     import attacks.inversion.train as module
 
     monkeypatch.setattr(module, "CHECKPOINT_EVERY", 3)
-    given = {"photographs": sources[:2], "validation": sources[2:3], "extractor": Sift(), "training": TINY}
-    whole = train(defense, {}, out=tmp_path / "whole.safetensors", **given)
+    plan = of_two(sources, defense=defense, training=TINY)
+    whole = train(plan, tmp_path / "whole.safetensors")
     # Interrupt the second one after its third step.
     advance, steps = module._Trainer._advance, []
 
@@ -203,13 +210,13 @@ def test_a_resumed_training_is_the_same_training(defense, sources, tmp_path, mon
 
     monkeypatch.setattr(module._Trainer, "_advance", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        train(defense, {}, out=tmp_path / "parts.safetensors", **given)
+        train(plan, tmp_path / "parts.safetensors")
     monkeypatch.setattr(module._Trainer, "_advance", advance)
-    parts = train(defense, {}, out=tmp_path / "parts.safetensors", **given)
+    parts = train(plan, tmp_path / "parts.safetensors")
     a, b = weights.load(tmp_path / "whole.safetensors"), weights.load(tmp_path / "parts.safetensors")
     assert a.digest == b.digest
     assert whole["validation"] == parts["validation"]
-    other = train(defense, {}, out=tmp_path / "other.safetensors", **given | {"training": dataclasses.replace(TINY, seed=1)})
+    other = train(dataclasses.replace(plan, training=dataclasses.replace(TINY, seed=1)), tmp_path / "other.safetensors")
     assert other["validation"] != whole["validation"]  # negative control
 
 
@@ -219,10 +226,10 @@ def test_views_made_on_demand_train_the_same_network(defense, sources, tmp_path,
     import attacks.inversion.train as module
 
     defense = dataclasses.replace(defense, words=2000) if isinstance(defense, LDP) else defense
-    given = {"photographs": sources[:2], "validation": sources[2:4], "extractor": Sift(), "training": TINY, "widths": (8, 8)}
-    kept = train(defense, {}, out=tmp_path / "kept.safetensors", **given)
+    plan = of_two(sources, defense=defense, training=TINY, widths=(8, 8))
+    kept = train(plan, tmp_path / "kept.safetensors")
     monkeypatch.setattr(module, "IN_MEMORY", 1)
-    made = train(defense, {}, out=tmp_path / "made.safetensors", **given)
+    made = train(plan, tmp_path / "made.safetensors")
     assert made == kept
     assert weights.load(tmp_path / "kept.safetensors").digest == weights.load(tmp_path / "made.safetensors").digest
 
@@ -271,16 +278,7 @@ def test_training_learns(sources, tmp_path):
 
     original, module._Trainer = module._Trainer, Watched
     try:
-        training = Training(steps=40, batch=2, warmup=5)
-        train(
-            Undefended(),
-            {},
-            photographs=sources[:2],
-            validation=sources[2:3],
-            out=tmp_path / "W",
-            extractor=Sift(),
-            training=training,
-        )
+        train(of_two(sources, training=Training(steps=40, batch=2, warmup=5)), tmp_path / "W")
     finally:
         module._Trainer = original
     assert np.mean(losses[-5:]) < 0.75 * np.mean(losses[:5])
@@ -289,17 +287,17 @@ def test_training_learns(sources, tmp_path):
 def test_a_checkpoint_of_another_training_is_refused(sources, tmp_path, monkeypatch):
     import attacks.inversion.train as module
 
-    given = {"photographs": sources[:2], "validation": sources[2:3], "extractor": Sift(), "out": tmp_path / "W.safetensors"}
+    plan, out = of_two(sources, training=TINY), tmp_path / "W.safetensors"
     monkeypatch.setattr(module.weights, "save", lambda *_: (_ for _ in ()).throw(OSError("the disk is full")))
     with pytest.raises(OSError, match="disk"):
-        train(Undefended(), {}, training=TINY, **given)
+        train(plan, out)
     with pytest.raises(UserError, match="another training"):
-        train(Undefended(), {}, training=dataclasses.replace(TINY, seed=1), **given)
+        train(dataclasses.replace(plan, training=dataclasses.replace(TINY, seed=1)), out)
 
 
 def test_photographs_in_both_sets_are_refused(sources, tmp_path):
     with pytest.raises(UserError, match="in both"):
-        train(Undefended(), {}, photographs=sources[:2], validation=sources[1:2], out=tmp_path / "W", extractor=Sift())
+        train(dataclasses.replace(of_two(sources), validation=sources[1:2]), tmp_path / "W")
 
 
 def test_own_photographs_quantise_to_nearly_themselves(sources, words):

@@ -10,8 +10,8 @@ from torch import distributed, nn
 
 import attacks.inversion.train as inversion
 from attacks.inversion import norm, weights
+from attacks.inversion.plan import PROFILES, Plan, Training
 from attacks.inversion.team import Team, launch
-from attacks.inversion.train import PROFILES, Training
 from bench.cli import main
 from bench.datasets import photographs
 from bench.features.sift import Sift
@@ -65,28 +65,30 @@ def losses(folder):
     return np.array([event.value for event in events.Scalars("loss")])
 
 
-def in_single_precision(team, *args, **kwargs):
+def in_single_precision(*given):
     """Train without half-precision's rounding, which grows from step to step."""
     inversion.pick_dtype = lambda device: torch.float32
-    return inversion._train(team, *args, **kwargs)
+    return inversion.take_part(*given)
 
 
-def without_joint_norms(*args, **kwargs):
+def without_joint_norms(*given):
     norm.joint = lambda module: None  # in a process of its own
-    return in_single_precision(*args, **kwargs)
+    return in_single_precision(*given)
 
 
 def asked(folder, name):
-    """What `_train` is told."""
+    """What `take_part` is told after the team."""
     sources = photographs.builtin()
-    data = {"photographs": sources[:2], "validation": sources[2:3], "extractor": Sift(), "crossfit": (), "encoding": "invariant"}
-    return data | {
-        "widths": (16, 16, 16),
-        "training": SHORT,
-        "start": None,
-        "out": folder / name,
-        "log": folder / f"log-{name}",
-    }
+    plan = Plan(
+        defense=Undefended(),
+        served={},
+        photographs=sources[:2],
+        validation=sources[2:3],
+        extractor=Sift(),
+        widths=(16, 16, 16),
+        training=SHORT,
+    )
+    return plan, folder / name, folder / f"log-{name}"
 
 
 # AdamW's first steps are signs of gradients, which rounding turns where they are small: at a low rate it does little.
@@ -99,7 +101,7 @@ def test_two_processes_train_as_one_with_the_joint_batch(tmp_path, monkeypatch):
     monkeypatch.setattr(inversion, "pick_dtype", inversion.pick_dtype)  # to put it back
     found = {}
     for name, (devices, how) in PROCESSES.items():
-        meta = launch(devices, SHORT.batch, how, Undefended(), {}, **asked(tmp_path, name))
+        meta = launch(devices, SHORT.batch, how, *asked(tmp_path, name))
         found[name] = losses(tmp_path / f"log-{name}"), meta["validation"]["ssim"]
     assert len(found["two"][0]) == SHORT.steps
     np.testing.assert_allclose(found["two"][0], found["one"][0], rtol=1e-5)
@@ -120,11 +122,11 @@ def test_two_processes_go_on_from_what_one_left(tmp_path, monkeypatch):
             raise KeyboardInterrupt
         return advance(self, *given)
 
-    launch(1, SHORT.batch, in_single_precision, Undefended(), {}, **asked(tmp_path, "whole"))
+    launch(1, SHORT.batch, in_single_precision, *asked(tmp_path, "whole"))
     monkeypatch.setattr(inversion._Trainer, "_advance", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        launch(1, SHORT.batch, in_single_precision, Undefended(), {}, **asked(tmp_path, "parts"))
-    launch(2, SHORT.batch, in_single_precision, Undefended(), {}, **asked(tmp_path, "parts"))
+        launch(1, SHORT.batch, in_single_precision, *asked(tmp_path, "parts"))
+    launch(2, SHORT.batch, in_single_precision, *asked(tmp_path, "parts"))
     assert len(losses(tmp_path / "log-parts")) == SHORT.steps  # two steps of one, two of both
     np.testing.assert_allclose(losses(tmp_path / "log-parts"), losses(tmp_path / "log-whole"), rtol=1e-5)
 

@@ -22,7 +22,8 @@ from make_assets import part
 import bench
 from attacks.dia import DIA
 from attacks.inversion import weights
-from attacks.inversion.train import Training, train
+from attacks.inversion.plan import Plan, Training
+from attacks.inversion.train import train
 from attacks.keypoints import Keypoints
 from attacks.repeat import Repeat
 from bench import registry, spec
@@ -138,17 +139,17 @@ class Study:
         file = self.work / f"{name}-{self.steps}.safetensors"
         given = "" if name == "privunit" else f":words={WORDS}"
         print(f"network for {name}", flush=True)
-        train(
-            spec.read(name + given, registry.DEFENSE),
-            SERVED[name],
+        plan = Plan(
+            defense=spec.read(name + given, registry.DEFENSE),
+            served=SERVED[name],
             photographs=self.photographs,
             validation=self.validation,
-            out=file,
             extractor=Sift(),
             start=self.start,
             widths=self.widths,
             training=Training(steps=self.steps, batch=BATCH, rate=RATE, warmup=20),
         )
+        train(plan, file)
         return file
 
     def attacked(self, networks: Mapping[str, Path]) -> dict[str, dict[str, list[Record]]]:

@@ -12,7 +12,8 @@ from pathlib import Path
 from make_assets import part
 
 from attacks.inversion.data import fitting_dictionaries, quantisation_error, quantise
-from attacks.inversion.train import Training, check_quantisation
+from attacks.inversion.plan import Training
+from attacks.inversion.train import check_quantisation
 from attacks.inversion.weights import describe
 from attacks.surroundings.network import Shape
 from attacks.surroundings.train import fit, lessons, validate

@@ -3,49 +3,32 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from attacks.inversion import train, weights
-from attacks.inversion.data import Served
-from attacks.inversion.encoding import Encoding
-from attacks.inversion.train import Training
+from attacks.inversion.plan import Plan
 from bench import cache, environment, provenance, spec
-from bench.datasets.photographs import Source
-from bench.plugin import Asset, Defense, Extractor
 from bench.public import Public
 
 KIND = "networks"
 
 
-def key(
-    defense: Defense,
-    served: Served,
-    *,
-    photographs: Sequence[Source],
-    validation: Sequence[Source],
-    extractor: Extractor,
-    crossfit: Sequence[Asset],
-    start: Path | None,
-    encoding: Encoding,
-    widths: tuple[int, ...],
-    training: Training,
-) -> dict[str, Any]:
-    """All that a network is a function of. Parameters as those of `train`."""
+def key(plan: Plan) -> dict[str, Any]:
+    """All that the network is a function of."""
     public = Public()
     return {
-        "defense": spec.configuration(defense, public),
-        "served": {field: str(setting) for field, setting in served.items()},
-        "photographs": [source.content_hash() for source in photographs],
-        "validation": [source.content_hash() for source in validation],
-        "extractor": spec.written(extractor),
-        "crossfit": [public.digest(asset) for asset in crossfit],
-        "start": None if start is None else weights.load(start).digest,
-        "encoding": encoding,
-        "widths": list(widths),
-        "training": dataclasses.asdict(training),
-        "source": provenance.source(train.__name__, type(defense).__module__, type(extractor).__module__),
+        "defense": spec.configuration(plan.defense, public),
+        "served": {field: str(setting) for field, setting in plan.served.items()},
+        "photographs": [source.content_hash() for source in plan.photographs],
+        "validation": [source.content_hash() for source in plan.validation],
+        "extractor": spec.written(plan.extractor),
+        "crossfit": [public.digest(asset) for asset in plan.crossfit],
+        "start": None if plan.start is None else weights.load(plan.start).digest,
+        "encoding": plan.encoding,
+        "widths": list(plan.widths),
+        "training": dataclasses.asdict(plan.training),
+        "source": provenance.source(train.__name__, type(plan.defense).__module__, type(plan.extractor).__module__),
         "environment": environment.computing(),
     }
 

@@ -13,7 +13,6 @@ import time
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,14 +25,14 @@ from attacks.inversion.data import Example, Examples, Served, fitting_dictionari
 from attacks.inversion.encoding import Encoding, Points, encode, stack
 from attacks.inversion.log import Log
 from attacks.inversion.loss import reconstruction_loss, ssim
-from attacks.inversion.network import COARSENET, Inverter, Shape, paint
+from attacks.inversion.network import Inverter, Shape, paint
+from attacks.inversion.plan import Plan, Training
 from attacks.inversion.team import Team, launch
 from bench import tensorfile
-from bench.datasets.photographs import Source
 from bench.device import pick_device, pick_dtype
 from bench.errors import UserError
 from bench.features.views import OnDemand, PhotographView, collect, photographs_of
-from bench.plugin import Asset, Defense, Extractor, OneOf
+from bench.plugin import Asset, Defense, OneOf
 from bench.progress import Progress
 from bench.public import Public
 from bench.types import WordSets
@@ -46,66 +45,12 @@ COMPARED = 1000  # training photographs, at most, whose quantisation error is co
 TOLERANCE = 0.05  # between the quantisation errors on training and on unseen photographs
 
 
-@dataclass(frozen=True, kw_only=True)
-class Training:
-    """How long and how fast."""
-
-    steps: int = 4000
-    batch: int = 8
-    rate: float = 2e-3  # AdamW's learning rate at its peak; cosine to zero
-    warmup: int = 100  # steps
-    decay: float = 0.02  # AdamW's weight decay
-    average: float = 0.998  # decay of the moving average of the weights
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if self.steps < 1 or self.batch < 1:
-            raise UserError(f"training needs at least one step of one photograph, got {self.steps} of {self.batch}")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Profile:
-    """The sizes of a network and of its training."""
-
-    widths: tuple[int, ...] = Shape.widths
-    training: Training = Training()  # frozen
-
-
-PROFILES = {
-    "cpu": Profile(),
-    # The paper's network and about as many photographs as it had, each seen 40 times: days of a GPU.
-    "paper": Profile(widths=COARSENET, training=Training(steps=125_000, batch=32, rate=1e-3, warmup=1000, average=0.9998)),
-}
-
-
-def train(
-    defense: Defense,
-    served: Served,
-    *,
-    photographs: Sequence[Source],
-    validation: Sequence[Source],
-    out: Path,
-    extractor: Extractor,
-    crossfit: Sequence[Asset] = (),
-    start: Path | None = None,
-    encoding: Encoding = "invariant",
-    widths: tuple[int, ...] = Shape.widths,
-    training: Training = Training(),  # frozen
-    log: Path | None = None,
-    devices: int = 1,
-) -> dict[str, Any]:
-    """Train, or resume, a network for the releases of `defense`, and return its metadata. What is done is not done again.
+def train(plan: Plan, out: Path, log: Path | None = None, devices: int = 1) -> dict[str, Any]:
+    """Train, or resume, a network, and return its metadata. What is done is not done again.
 
     Parameters
     ----------
-    defense : the settings that are fixed
-    served : fields whose settings are drawn at random in training; one network serves them all
-    photographs, validation : no photograph should be in both
     out : the weights' file; a checkpoint is kept beside it until training is done
-    crossfit : dictionaries for photographs that helped to make the defense's own
-    start : weights of a network for raw descriptors to start from; random ones if None
-    encoding : what the network is told of a keypoint
-    widths : of the network's levels
     log : folder for TensorBoard: loss, rate and speed of each step, and the validation's scores
     devices : how many share each batch; what comes out is the same but for rounding
 
@@ -115,59 +60,29 @@ def train(
         if photographs are in both sets, no photograph can be used, or `out` or its checkpoint is of another training; there
         is to be a log, and tensorboard is not installed; or there are too few devices.
     """
-    return launch(
-        devices,
-        training.batch,
-        _train,
-        defense,
-        served,
-        photographs=photographs,
-        validation=validation,
-        out=out,
-        extractor=extractor,
-        crossfit=crossfit,
-        start=start,
-        encoding=encoding,
-        widths=widths,
-        training=training,
-        log=log,
-    )
+    return launch(devices, plan.training.batch, take_part, plan, out, log)
 
 
-def _train(
-    team: Team,
-    defense: Defense,
-    served: Served,
-    *,
-    photographs: Sequence[Source],
-    validation: Sequence[Source],
-    out: Path,
-    extractor: Extractor,
-    crossfit: Sequence[Asset],
-    start: Path | None,
-    encoding: Encoding,
-    widths: tuple[int, ...],
-    training: Training,
-    log: Path | None,
-) -> dict[str, Any]:
-    """One process's share of `train`."""
+def take_part(team: Team, plan: Plan, out: Path, log: Path | None) -> dict[str, Any]:
+    """One process's part of `train`."""
     written = Log(log if team.leads else None)
-    shared = {source.content_hash() for source in photographs} & {source.content_hash() for source in validation}
+    defense, extractor, encoding, training = plan.defense, plan.extractor, plan.encoding, plan.training
+    shared = {source.content_hash() for source in plan.photographs} & {source.content_hash() for source in plan.validation}
     if shared:
         raise UserError(f"{len(shared)} photographs are in both the training and the validation set")
-    few = len(photographs) <= IN_MEMORY
-    views = collect(list(photographs), extractor) if few else OnDemand(photographs, extractor)
-    unseen = collect(list(validation), extractor)[::4]  # as they are, at 256 pixels
-    examples, held_out, errors = _examples(defense, served, views, unseen, crossfit)
+    few = len(plan.photographs) <= IN_MEMORY
+    views = collect(list(plan.photographs), extractor) if few else OnDemand(plan.photographs, extractor)
+    unseen = collect(list(plan.validation), extractor)[::4]  # as they are, at 256 pixels
+    examples, held_out, errors = _examples(plan, views, unseen)
     slots, length = _stacked(defense, held_out, unseen[0], encoding)
     sample = encode([(first := held_out.whole(unseen[0], np.random.default_rng(0))).release], [first.condition], slots, encoding)
     one_by_one = slots if encoding == "invariant" and defense.releases is WordSets else 0
-    shape = Shape(inputs=sample.values.shape[1], candidates=one_by_one, length=length, widths=widths)
+    shape = Shape(inputs=sample.values.shape[1], candidates=one_by_one, length=length, widths=plan.widths)
     meta = {
-        **weights.describe(defense, dict(served), extractor, Public()),
+        **weights.describe(defense, dict(plan.served), extractor, Public()),
         "encoding": encoding,
         "slots": slots,
-        "start": None if start is None else weights.load(start).digest,
+        "start": None if plan.start is None else weights.load(plan.start).digest,
         "photographs": len(photographs_of(views)),
         "crops": training.steps * training.batch,
         "batch": training.batch,
@@ -180,9 +95,9 @@ def _train(
         _same_training(out, done, meta)
         return done
     trainer = _Trainer(team, shape, training, out, meta, written)
-    if start is not None and trainer.step == 0:
+    if plan.start is not None and trainer.step == 0:
         read_as_descriptors = slots if defense.releases is WordSets and not one_by_one else 1
-        trainer.start_from(weights.load(start).module, read_as_descriptors)
+        trainer.start_from(weights.load(plan.start).module, read_as_descriptors)
     module = trainer.run(examples)
     if not team.leads:
         return meta
@@ -202,14 +117,15 @@ def _same_training(path: Path, found: Mapping[str, Any], wanted: Mapping[str, An
 
 
 def _examples(
-    defense: Defense, served: Served, views: Sequence[PhotographView], unseen: list[PhotographView], crossfit: Sequence[Asset]
+    plan: Plan, views: Sequence[PhotographView], unseen: list[PhotographView]
 ) -> tuple[Examples, Examples, dict[str, float] | None]:
     """Training and validation examples, and the quantisation error on both where descriptors are quantised."""
+    defense, served = plan.defense, plan.served
     if defense.quantised_by is None:
         return Examples(views, defense, served, {}, Public()), Examples(unseen, defense, served, {}, Public()), None
     own = Asset(getattr(defense, defense.quantised_by))
     plain = Public()
-    chosen = fitting_dictionaries(photographs_of(views), [own, *crossfit], plain)
+    chosen = fitting_dictionaries(photographs_of(views), [own, *plan.crossfit], plain)
     chosen_unseen = fitting_dictionaries(photographs_of(unseen), [own], plain)
     sizes = _sizes(defense, served)
     public = Public(remembered=0) if isinstance(views, OnDemand) else Public(quantise(views, chosen, sizes, plain), remembered=0)

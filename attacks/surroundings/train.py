@@ -18,7 +18,7 @@ import torch.nn.functional as nnf
 from torch import Tensor
 
 from attacks.inversion.data import random_crop
-from attacks.inversion.train import Training
+from attacks.inversion.plan import Training
 from attacks.surroundings.network import Belief, Scene, Shape, Surroundings
 from attacks.surroundings.scenes import prior_odds, scene
 from bench.device import pick_device

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 from pathlib import Path
-from typing import Any
 
 from bench.terminal import DONE, add_extractor, add_seed, whole, wholes
 
@@ -50,7 +49,8 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 def execute(args: argparse.Namespace) -> int:
     from attacks.inversion import kept
-    from attacks.inversion.train import PROFILES, train
+    from attacks.inversion.plan import PROFILES, Plan
+    from attacks.inversion.train import train
     from bench import registry, spec
     from bench.datasets.photographs import folder, held_out
     from bench.plugin import Asset
@@ -61,20 +61,22 @@ def execute(args: argparse.Namespace) -> int:
     photographs, validation = held_out(folder(args.images), args.validation)
     profile = PROFILES[args.profile]
     chosen = {name: value for name in ("steps", "batch", "rate", "seed") if (value := getattr(args, name)) is not None}
-    asked: dict[str, Any] = {
-        "photographs": photographs,
-        "validation": validation,
-        "extractor": spec.read(args.extractor, registry.EXTRACTOR),
-        "crossfit": [Asset(file) for file in args.crossfit],
-        "start": args.start,
-        "encoding": args.encoding,
-        "widths": args.widths or profile.widths,
-        "training": dataclasses.replace(profile.training, **chosen),
-    }
-    key = kept.key(defense, served, **asked)
+    plan = Plan(
+        defense=defense,
+        served=served,
+        photographs=photographs,
+        validation=validation,
+        extractor=spec.read(args.extractor, registry.EXTRACTOR),
+        crossfit=[Asset(file) for file in args.crossfit],
+        start=args.start,
+        encoding=args.encoding,
+        widths=args.widths or profile.widths,
+        training=dataclasses.replace(profile.training, **chosen),
+    )
+    key = kept.key(plan)
     meta = kept.fetch(key, args.out)
     if meta is None:
-        meta = train(defense, served, out=args.out, log=args.log, devices=args.devices, **asked)
+        meta = train(plan, args.out, args.log, args.devices)
         kept.keep(key, args.out)
     scores = ", ".join(f"{name} {value:.4g}" for name, value in meta["validation"].items())
     print(f"{args.out}: {meta['crops']} crops of {meta['photographs']} photographs; validation: {scores}")

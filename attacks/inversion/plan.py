@@ -1,0 +1,62 @@
+"""What a network is a function of: releases, photographs, sizes, and how long it trains."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from attacks.inversion.data import Served
+from attacks.inversion.encoding import Encoding
+from attacks.inversion.network import COARSENET, Shape
+from bench.datasets.photographs import Source
+from bench.errors import UserError
+from bench.plugin import Asset, Defense, Extractor
+
+
+@dataclass(frozen=True, kw_only=True)
+class Training:
+    """How long and how fast."""
+
+    steps: int = 4000
+    batch: int = 8
+    rate: float = 2e-3  # AdamW's learning rate at its peak; cosine to zero
+    warmup: int = 100  # steps
+    decay: float = 0.02  # AdamW's weight decay
+    average: float = 0.998  # decay of the moving average of the weights
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.steps < 1 or self.batch < 1:
+            raise UserError(f"training needs at least one step of one photograph, got {self.steps} of {self.batch}")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Plan:
+    """One training. No photograph should be in both sets."""
+
+    defense: Defense  # with the settings that are fixed
+    served: Served  # fields whose settings are drawn at random in training; one network serves them all
+    photographs: Sequence[Source]
+    validation: Sequence[Source]
+    extractor: Extractor
+    crossfit: Sequence[Asset] = ()  # dictionaries for photographs that helped to make the defense's own
+    start: Path | None = None  # weights of a network for raw descriptors to start from; random ones if None
+    encoding: Encoding = "invariant"  # what the network is told of a keypoint
+    widths: tuple[int, ...] = Shape.widths  # of the network's levels
+    training: Training = Training()  # frozen
+
+
+@dataclass(frozen=True, kw_only=True)
+class Profile:
+    """The sizes of a network and of its training."""
+
+    widths: tuple[int, ...] = Shape.widths
+    training: Training = Training()  # frozen
+
+
+PROFILES = {
+    "cpu": Profile(),
+    # The paper's network and about as many photographs as it had, each seen 40 times: days of a GPU.
+    "paper": Profile(widths=COARSENET, training=Training(steps=125_000, batch=32, rate=1e-3, warmup=1000, average=0.9998)),
+}
