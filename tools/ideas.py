@@ -10,6 +10,7 @@ docs/ideas.jsonl, a line a training, and the page docs/ideas.md is written from 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import math
 import pickle
@@ -50,13 +51,14 @@ INPUTS = 128 + 2  # a raw descriptor, and the place within a cell
 # ---- losses
 
 
-def loss(painted: Tensor, photograph: Tensor, dissimilarity: float, l1: float, rmse: float, coarse: float) -> Tensor:
-    """A weighted sum: 1 - SSIM of luminance, L1, the root of each image's mean square error, L1 of four coarser scales."""
+def loss(painted: Tensor, photograph: Tensor, dissimilarity: float, l1: float, rmse: float, psnr: float, coarse: float) -> Tensor:
+    """A weighted sum: 1 - SSIM of luminance, L1, root and logarithm of each image's square error, L1 of four coarser scales."""
     luma = torch.tensor(LUMA, device=painted.device).view(1, 3, 1, 1)
     total = dissimilarity * (1 - ssim((painted * luma).sum(dim=1), (photograph * luma).sum(dim=1)))
     total = total + l1 * (painted - photograph).abs().mean()
-    if rmse:
-        total = total + rmse * ((painted - photograph).square().mean(dim=(1, 2, 3)) + 1e-4).sqrt().mean()
+    if rmse or psnr:
+        mse = (painted - photograph).square().mean(dim=(1, 2, 3)) + 1e-4
+        total = total + rmse * mse.sqrt().mean() + psnr * mse.log().mean()
     if coarse:
         for _ in range(4):
             painted, photograph = nnf.avg_pool2d(painted, 2), nnf.avg_pool2d(photograph, 2)
@@ -87,6 +89,8 @@ class Quarter(nn.Module):
         attention: int = 0,  # blocks that look at the nearest keypoints, before anything is scattered
         last: int = 32,  # channels at half of the image's side
         deep: int = 1,  # residual blocks a level
+        joined: bool = True,  # whether the encoder's levels are joined to the decoder's, or added to them
+        glances: int = 0,  # blocks of attention over the deepest level but one
     ) -> None:
         super().__init__()
         first, *deeper = widths
@@ -100,7 +104,8 @@ class Quarter(nn.Module):
         self.down = nn.ModuleList(
             nn.Sequential(conv_norm(narrow, wide, stride=2), *(Residual(wide) for _ in range(deep))) for narrow, wide in pairs
         )
-        self.up = nn.ModuleList(Up(wide, narrow) for narrow, wide in reversed(pairs))
+        self.up = nn.ModuleList((Up if joined else Added)(wide, narrow) for narrow, wide in reversed(pairs))
+        self.glances = nn.ModuleList(Glance(deeper[-1]) for _ in range(glances))
         self.narrow = nn.Conv2d(first, last, 1)
         self.refine = conv_norm(last, last)
         self.paint = nn.Conv2d(last, 12, 3, padding=1)
@@ -123,6 +128,8 @@ class Quarter(nn.Module):
         for down in self.down:
             levels.append(down(levels[-1]))
         level = levels.pop()
+        for glance in self.glances:
+            level = glance(level)
         for up in self.up:
             level = up(level, levels.pop())
         grown = nnf.interpolate(self.narrow(level), scale_factor=2.0, mode="nearest")
@@ -140,6 +147,35 @@ class Quarter(nn.Module):
         painted = self.around(hidden).view(-1, self.painted)
         grid = scattered(painted, image.repeat_interleave(size * size), cells, wide, batch)
         return grid[:, size : size + side, size : size + side]
+
+
+class Added(nn.Module):
+    """As `Up`, with half of its operations: the encoder's level is added."""
+
+    def __init__(self, wide: int, narrow: int) -> None:
+        super().__init__()
+        self.narrow = nn.Conv2d(wide, narrow, 1)
+        self.join, self.refine = conv_norm(narrow, narrow), conv_norm(narrow, narrow)
+
+    def forward(self, deep: Tensor, skip: Tensor) -> Tensor:
+        return self.refine(self.join(nnf.interpolate(self.narrow(deep), scale_factor=2.0, mode="nearest") + skip))
+
+
+class Glance(nn.Module):
+    """Attention of every cell to every other, and a layer of its own. (B, C, H, W) -> the same."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.norm, self.other = nn.LayerNorm(channels), nn.LayerNorm(channels)
+        self.attend = nn.MultiheadAttention(channels, 4, batch_first=True)
+        self.own = nn.Sequential(nn.Linear(channels, 2 * channels), nn.SiLU(), nn.Linear(2 * channels, channels))
+
+    def forward(self, level: Tensor) -> Tensor:
+        cells = level.flatten(2).transpose(1, 2)
+        normed = self.norm(cells)
+        cells = cells + self.attend(normed, normed, normed, need_weights=False)[0]
+        cells = cells + self.own(self.other(cells))
+        return cells.transpose(1, 2).reshape(level.shape).to(level.dtype)
 
 
 def scattered(values: Tensor, image: Tensor, cell: Tensor, side: int, batch: int) -> Tensor:
@@ -211,13 +247,16 @@ class Idea:
     decay: float = 0.02
     average: float = 0.998
     photographs: int = 800
+    dropped: float = 0.0  # share of keypoints
     upright: bool = True
 
 
-AS_IT_IS = {"dissimilarity": 0.3, "l1": 1.0, "rmse": 0.0, "coarse": 0.0}
+AS_IT_IS = {"dissimilarity": 0.3, "l1": 1.0, "rmse": 0.0, "psnr": 0.0, "coarse": 0.0}
 IDEAS = {
     "as bench train": Idea(),
     "loss: rmse for l1": Idea(loss={"l1": 0.0, "rmse": 1.0}),
+    "loss: psnr beside l1": Idea(loss={"psnr": 0.05}),
+    "loss: psnr for l1": Idea(loss={"l1": 0.0, "psnr": 0.1}),
     "loss: coarser scales": Idea(loss={"coarse": 0.25}),
     "rate 4e-3": Idea(rate=4e-3),
     "rate 1e-3": Idea(rate=1e-3),
@@ -226,6 +265,12 @@ IDEAS = {
     "half the channels": Idea(network=lambda: Inverter(Shape(inputs=INPUTS, widths=(16, 32, 80, 112, 112)))),
     "quarter": Idea(network=Quarter),
     "quarter, patches": Idea(network=lambda: Quarter(patch=6)),
+    "quarter, patches, added": Idea(network=lambda: Quarter(patch=6, joined=False)),
+    "quarter, patches, added, glances": Idea(network=lambda: Quarter(patch=6, joined=False, glances=2)),
+    "quarter, patches, added, deep": Idea(network=lambda: Quarter(patch=6, joined=False, deep=2)),
+    "quarter, patches, added, 512 hidden": Idea(network=lambda: Quarter(patch=6, joined=False, hidden=512)),
+    "keypoint dropout": Idea(dropped=0.2),
+    "short average": Idea(average=0.99),
     "quarter, attention": Idea(network=lambda: Quarter(attention=2)),
     "quarter, thin, patches": Idea(network=lambda: Quarter(widths=(48, 112, 192, 224), patch=6)),
     "200 photographs": Idea(photographs=200),
@@ -291,6 +336,9 @@ def fit(network: nn.Module, examples: Examples, idea: Idea, seconds: float) -> i
             points, photographs = to_batch([examples.draw(rng) for _ in range(idea.batch)], 1, "invariant")
             for group in optimizer.param_groups:
                 group["lr"] = idea.rate * min(1.0, (step + 1) / 50) * 0.5 * (1 + math.cos(math.pi * share))
+            if idea.dropped:
+                kept = torch.from_numpy(rng.random(len(points.cells)) >= idea.dropped)
+                points = dataclasses.replace(points, values=points.values[kept], cells=points.cells[kept])
             with torch.autocast(device.type, dtype, enabled=dtype != torch.float32):
                 painted = network(points.to(device))
             value = loss(painted, photographs.to(device), **weights)
