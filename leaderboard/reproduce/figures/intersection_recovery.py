@@ -61,8 +61,9 @@ def drawn(scene: Scene) -> Iterator[tuple[str, Figure]]:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9.6, 3.9), layout="constrained", dpi=120)
-    photographs = len(scene.judged.chosen)
-    figure.suptitle(f"The intersection attack, which knows no database; mean over {photographs} photographs", fontsize=9)
+    count = len(scene.judged.chosen)
+    over = f"mean over {count} photograph{'s' * (count > 1)}"
+    figure.suptitle(f"The intersection attack, which knows no database; stars: the database attack; {over}", fontsize=9)
     shares, pictures = figure.subplots(1, 2)
     for number, dim in enumerate(table1.DIMS):
         seen, color = counts(scene.setting, dim), f"C{number}"
@@ -80,7 +81,7 @@ def drawn(scene: Scene) -> Iterator[tuple[str, Figure]]:
         axes.set_xticks(sorted({count for dim in table1.DIMS for count in counts(scene.setting, dim)}))
         axes.xaxis.set_major_formatter(lambda count, place: f"{count:g}")
         axes.tick_params(axis="x", labelsize=7)
-        axes.set_xlabel("photographs seen (one in 16 shares the words); stars: the database attack")
+        axes.set_xlabel("photographs seen (one in 16 shares the words)", fontsize=9)
         axes.grid(alpha=0.3)
     shares.set_ylim(0, 1.04)
     shares.legend(fontsize=7, ncols=2)
