@@ -220,12 +220,11 @@ def test_a_resumed_training_is_the_same_training(defense, sources, tmp_path, mon
     assert other["validation"] != whole["validation"]  # negative control
 
 
-@pytest.mark.parametrize("defense", [Undefended(), LDP(epsilon=8, subset_size=2)])
+@pytest.mark.parametrize("defense", [Undefended(), LDP(epsilon=8, subset_size=2, words=2000)])
 def test_views_made_on_demand_train_the_same_network(defense, sources, tmp_path, monkeypatch):
     """What does not fit into memory is read again and again, and changes nothing."""
     import attacks.inversion.train as module
 
-    defense = dataclasses.replace(defense, words=2000) if isinstance(defense, LDP) else defense
     plan = of_two(sources, defense=defense, training=TINY, widths=(8, 8))
     kept = train(plan, tmp_path / "kept.safetensors")
     monkeypatch.setattr(module, "IN_MEMORY", 1)
@@ -234,7 +233,7 @@ def test_views_made_on_demand_train_the_same_network(defense, sources, tmp_path,
     assert weights.load(tmp_path / "kept.safetensors").digest == weights.load(tmp_path / "made.safetensors").digest
 
 
-def test_views_on_demand_leave_out_what_cannot_be_read(sources, tmp_path, rng, capsys):
+def test_views_on_demand_leave_out_what_cannot_be_read(sources, tmp_path, rng):
     spoilt = Source("spoilt", tmp_path / "spoilt.png")
     spoilt.path.write_bytes(b"no picture")
     lazy, eager = OnDemand([spoilt, sources[0]], Sift()), collect([spoilt, sources[0]], Sift())

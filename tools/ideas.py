@@ -28,9 +28,10 @@ from torch import Tensor, nn
 
 from attacks.inversion.data import Examples
 from attacks.inversion.encoding import Points, encode
-from attacks.inversion.loss import LUMA, ssim
+from attacks.inversion.loss import LUMA, WEIGHT, ssim
 from attacks.inversion.mirror import mirrored
 from attacks.inversion.network import Inverter, Residual, Shape, Up, conv_norm, paint
+from attacks.inversion.plan import Training
 from attacks.inversion.train import to_batch, validate
 from bench.datasets.photographs import folder
 from bench.device import pick_device, pick_dtype
@@ -45,6 +46,7 @@ from leaderboard.tables import markdown_row
 DOCS = Path(__file__).parents[1] / "docs"
 LOG, PAGE = DOCS / "ideas.jsonl", DOCS / "ideas.md"
 SIZES = ("crops", "parameters", "photographs", "date")
+WARMUP = 50  # steps; fewer than `bench train` takes, for these trainings are short
 INPUTS = 128 + 2  # a raw descriptor, and the place within a cell
 
 
@@ -242,16 +244,16 @@ class Idea:
 
     network: Callable[[], nn.Module] = lambda: Inverter(Shape(inputs=INPUTS))
     loss: dict[str, float] = field(default_factory=dict)
-    batch: int = 8
-    rate: float = 2e-3
-    decay: float = 0.02
-    average: float = 0.998
+    batch: int = Training.batch
+    rate: float = Training.rate
+    decay: float = Training.decay
+    average: float = Training.average
     photographs: int = 800
     dropped: float = 0.0  # share of keypoints
     upright: bool = True
 
 
-AS_IT_IS = {"dissimilarity": 0.3, "l1": 1.0, "rmse": 0.0, "psnr": 0.0, "coarse": 0.0}
+AS_IT_IS = {"dissimilarity": WEIGHT, "l1": 1.0, "rmse": 0.0, "psnr": 0.0, "coarse": 0.0}
 IDEAS = {
     "as bench train": Idea(),
     "loss: rmse for l1": Idea(loss={"l1": 0.0, "rmse": 1.0}),
@@ -335,7 +337,7 @@ def fit(network: nn.Module, examples: Examples, idea: Idea, seconds: float) -> i
             rng = np.random.default_rng([0, step])
             points, photographs = to_batch([examples.draw(rng) for _ in range(idea.batch)], 1, "invariant")
             for group in optimizer.param_groups:
-                group["lr"] = idea.rate * min(1.0, (step + 1) / 50) * 0.5 * (1 + math.cos(math.pi * share))
+                group["lr"] = idea.rate * min(1.0, (step + 1) / WARMUP) * 0.5 * (1 + math.cos(math.pi * share))
             if idea.dropped:
                 kept = torch.from_numpy(rng.random(len(points.cells)) >= idea.dropped)
                 points = dataclasses.replace(points, values=points.values[kept], cells=points.cells[kept])
