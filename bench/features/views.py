@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import overload
 
 import numpy as np
-from PIL import Image
 
 from bench.datasets.photographs import Source, decode, square
 from bench.errors import UnitError, UserError
@@ -18,7 +17,7 @@ from bench.progress import Progress
 from bench.types import Bytes, Features
 
 SIDES = (256, 320)  # pixels
-KINDS = [(side, mirrored) for side in SIDES for mirrored in (False, True)]
+MIRRORED = (False, True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,13 +39,13 @@ def views(source: Source, extractor: Extractor) -> Iterator[PhotographView]:
     """
     image, _ = decode(source.path)
     photograph = source.content_hash()
-    for kind in KINDS:
-        yield _view(image, photograph, kind, source, extractor)
+    for side in SIDES:
+        pixels = square(image, side)
+        for mirrored in MIRRORED:
+            yield _view(pixels, mirrored, photograph, source, extractor)
 
 
-def _view(image: Image.Image, photograph: str, kind: tuple[int, bool], source: Source, extractor: Extractor) -> PhotographView:
-    side, mirrored = kind
-    pixels = square(image, side)
+def _view(pixels: Bytes, mirrored: bool, photograph: str, source: Source, extractor: Extractor) -> PhotographView:
     if mirrored:
         pixels = np.ascontiguousarray(pixels[:, ::-1])
     return PhotographView(photograph, pixels, extractor.extract(pixels, source.path))
@@ -60,12 +59,13 @@ class OnDemand(Sequence[PhotographView]):
 
     def __init__(self, sources: Sequence[Source], extractor: Extractor) -> None:
         self._extractor = extractor
-        self._which = [(source, kind) for source in sources for kind in KINDS]
+        self._which = [(source, side, mirrored) for source in sources for side in SIDES for mirrored in MIRRORED]
+        self._photograph = functools.cache(Source.content_hash)  # which reads the whole file
 
-    @functools.cached_property
+    @property
     def photographs(self) -> set[str]:
         """Content hashes, for which every photograph is read once."""
-        return {source.content_hash() for source in {source for source, _ in self._which}}
+        return {self._photograph(source) for source, _, _ in self._which}
 
     def __len__(self) -> int:
         return len(self._which)
@@ -84,10 +84,11 @@ class OnDemand(Sequence[PhotographView]):
         """
         if isinstance(place, slice):
             some = OnDemand((), self._extractor)
-            some._which = self._which[place]
+            some._which, some._photograph = self._which[place], self._photograph
             return some
-        source, kind = self._which[place]
-        return _view(decode(source.path)[0], source.content_hash(), kind, source, self._extractor)
+        source, side, mirrored = self._which[place]
+        image, _ = decode(source.path)
+        return _view(square(image, side), mirrored, self._photograph(source), source, self._extractor)
 
     def __iter__(self) -> Iterator[PhotographView]:
         for place in range(len(self)):
