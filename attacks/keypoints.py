@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from attacks.inversion.encoding import encode
-from attacks.inversion.network import paint
+from attacks.inversion.mirror import elsewhere
+from attacks.inversion.painting import painted
 from attacks.inversion.weights import Network, load, other_features
 from bench.errors import UserError
 from bench.plugin import Asset, Defense, Extractor, ImageAttack, View
@@ -39,8 +39,8 @@ class Keypoints(ImageAttack):
         return {"weights": self._network().digest}
 
     def reconstruct(self, view: View, rng: np.random.Generator) -> Floats:
-        points = encode([view.release], [np.empty(0, np.float32)], 0, "positions")
-        return paint(self._network().module, points)[0].permute(1, 2, 0).cpu().numpy()
+        known = np.empty(0, np.float32)
+        return painted(self._network().module, view.release, elsewhere(view.release), known, 0, "positions")
 
     def _network(self) -> Network:
         if self.weights != "shipped":

@@ -10,7 +10,8 @@ from skimage.metrics import structural_similarity
 from attacks.inversion import data, weights
 from attacks.inversion.encoding import Points, condition, encode, stack
 from attacks.inversion.loss import reconstruction_loss, ssim
-from attacks.inversion.network import Inverter, Shape, paint
+from attacks.inversion.network import Inverter, Shape
+from attacks.inversion.painting import paint
 from attacks.inversion.plan import Plan, Training
 from attacks.inversion.train import check_quantisation, train
 from bench.cli import main
@@ -136,9 +137,10 @@ def test_encoding_pads_and_places(rng):
     assert points.values.shape == (10, 4 * 128 + 2 + 1)
     assert (points.values[:, 3 * 128 : 4 * 128] == 0).all()
     assert (points.values[:, -1] == 0.25).all()
-    row, column = int(release.keypoints[0, 1] // 2), int(release.keypoints[0, 0] // 2)
-    assert points.cells[0] == row * 128 + column
-    assert points.cells[5] == 128 * 128 + row * 128 + column
+    row, column = int(release.keypoints[0, 1] // 4), int(release.keypoints[0, 0] // 4)
+    assert points.places[0].long().tolist() == [column, row]
+    assert points.image.tolist() == [0] * 5 + [1] * 5
+    assert points.grid == (64, 64)
     with pytest.raises(ValueError, match="at most 2"):
         encode([release], [np.empty(0, np.float32)], slots=2, encoding="invariant")
 
@@ -147,7 +149,7 @@ def test_keypoints_on_the_border_stay_in_the_grid():
     corners = np.array([[0, 0], [256, 256], [-1, 300]], np.float32)
     release = Descriptors(keypoints=corners, size=(256, 256), descriptors=np.zeros((3, 128), np.float32))
     points = encode([release], [np.empty(0, np.float32)], slots=1, encoding="invariant")
-    assert points.cells.tolist() == [0, 128 * 128 - 1, 127 * 128]
+    assert points.places.long().tolist() == [[0, 0], [63, 63], [0, 63]]
 
 
 def test_conditions_are_the_served_settings():
@@ -156,18 +158,46 @@ def test_conditions_are_the_served_settings():
     assert condition(Undefended(), {}).shape == (0,)
 
 
-def test_keypoints_that_share_a_cell_are_added_up(rng):
-    """The rule of `network.py`, whatever the order of the keypoints."""
-    net = Inverter(Shape(inputs=130)).eval()
-    values = torch.from_numpy(rng.normal(size=(3, 130)).astype(np.float32))
-    cells = torch.tensor([7, 7, 9])
+def scattered(net, values, places, size=(64, 48)):
     with torch.inference_mode():
-        grid = net.scatter(Points(values, cells, 1, (16, 16)))[0].flatten(1)  # (C, 256)
-        one = net.embed(values)
-    torch.testing.assert_close(grid[:-1, 7], one[0] + one[1])
-    assert grid[-1, [7, 9, 8]].tolist() == [2, 1, 0]
-    swapped = Points(values.flip(0), cells.flip(0), 1, (16, 16))
-    torch.testing.assert_close(net.scatter(swapped)[0].flatten(1), grid)
+        return net.scatter(Points(values, places, torch.zeros(len(values), dtype=torch.int64), 1, size))[0]  # (C, H/4, W/4)
+
+
+@pytest.mark.parametrize("patch", [5, 6])
+def test_keypoints_that_share_a_cell_are_added_up(patch, rng):
+    """The rule of `network.py`, whatever the order of the keypoints; patches reach as far on all sides, and not outside."""
+    net = Inverter(Shape(inputs=130, patch=patch, painted=2)).eval()
+    values = torch.from_numpy(rng.normal(size=(3, 130)).astype(np.float32))
+    places = torch.tensor([[7.3, 1.8], [7.6, 1.2], [0.2, 15.7]])
+    grid = scattered(net, values, places)
+    expected = torch.zeros(16, 12, 66)
+    with torch.inference_mode():
+        hidden = net.embed(values)
+        own, around = net.own(hidden), net.around(hidden).view(3, patch, patch, 2)
+    for keypoint, (x, y) in enumerate(places.tolist()):
+        expected[int(y), int(x), :63] += own[keypoint]
+        expected[int(y), int(x), 63] += 1
+        for row in range(patch):
+            for column in range(patch):
+                # The patch's middle is the keypoint, to half a cell.
+                down, right = int(np.floor(y - (patch - 1) / 2)) + row, int(np.floor(x - (patch - 1) / 2)) + column
+                if 0 <= down < 16 and 0 <= right < 12:
+                    expected[down, right, 64:] += around[keypoint, row, column]
+    torch.testing.assert_close(grid, expected.permute(2, 0, 1), atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(scattered(net, values.flip(0), places.flip(0)), grid, atol=1e-5, rtol=1e-5)
+    assert not torch.allclose(scattered(net, values.flip(0), places), grid, atol=1e-2)  # control: it matters who lies where
+
+
+@pytest.mark.parametrize("size", [(256, 256), (255, 130), (7, 1)])
+def test_an_image_of_any_size_is_painted(size, rng):
+    height, width = size
+    release = Descriptors(
+        keypoints=rng.uniform(0, (width, height), (5, 2)).astype(np.float32),
+        size=(width, height),
+        descriptors=rng.normal(size=(5, 128)).astype(np.float32),
+    )
+    points = encode([release], [np.empty(0, np.float32)], slots=1, encoding="invariant")
+    assert paint(Inverter(Shape(inputs=130, widths=(8, 8, 8))).eval(), points).shape == (1, 3, height, width)
 
 
 def test_ssim_of_the_loss_is_scikit_images(rng):

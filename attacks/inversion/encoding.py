@@ -6,6 +6,7 @@ Dense feature maps of 128·m channels (paper, Sec. 5.3) are never built: each ke
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import singledispatch
@@ -18,7 +19,7 @@ from torch import Tensor
 from bench.plugin import Between, Defense, OneOf
 from bench.types import Descriptors, Floats, Release, Subspaces, WordSets
 
-CELL = 2  # pixels: the side of the cells that keypoints are scattered to
+CELL = 4  # pixels: the side of the cells that keypoints are scattered to
 DIRECTIONS = 16  # that are projected onto subspaces
 TYPICAL_SCALE = 4.0  # pixels
 
@@ -28,12 +29,18 @@ class Points:
     """The keypoints of a batch of B releases, P in all."""
 
     values: Tensor  # (P, F) float32
-    cells: Tensor  # (P,) int64, row of the flattened (B, H/2, W/2) grid
+    places: Tensor  # (P, 2) float32, column and row in cells
+    image: Tensor  # (P,) int64, which of the batch's
     batch: int  # B
-    grid: tuple[int, int]  # H/2, W/2
+    size: tuple[int, int]  # H, W in pixels
+
+    @property
+    def grid(self) -> tuple[int, int]:
+        """Rows and columns of cells; the last ones may lie partly outside of the image."""
+        return math.ceil(self.size[0] / CELL), math.ceil(self.size[1] / CELL)
 
     def to(self, device: torch.device) -> Points:
-        return Points(self.values.to(device), self.cells.to(device), self.batch, self.grid)
+        return Points(self.values.to(device), self.places.to(device), self.image.to(device), self.batch, self.size)
 
 
 # What a network is told of a keypoint: what was released as it was released (the paper's stacking: m words in order, or a random
@@ -123,8 +130,7 @@ def encode(releases: list[Release], conditions: list[Floats], slots: int, encodi
         if a release has more candidates a keypoint than `slots`.
     """
     width, height = releases[0].size
-    columns, rows = width // CELL, height // CELL
-    values, cells = [], []
+    values, places, image = [], [], []
     for number, (release, known) in enumerate(zip(releases, conditions, strict=True)):
         stacked = stack(release, encoding)  # (N, s, D)
         count, used, length = stacked.shape
@@ -133,15 +139,15 @@ def encode(releases: list[Release], conditions: list[Floats], slots: int, encodi
         candidates = np.zeros((count, slots * length), dtype=np.float32)
         # Unit rows of length D, scaled so that an element is about 1.
         candidates[:, : used * length] = stacked.reshape(count, used * length) * np.float32(length**0.5)
-        place = np.clip(release.keypoints, 0, np.array([width, height]) - 1e-3)
-        cell = (place // CELL).astype(np.int64)  # (N, 2) column, row
-        within = place / CELL - cell - 0.5
-        told = np.broadcast_to(known, (count, len(known)))
-        values.append(np.concatenate([candidates, within, _frames(release), told], axis=1, dtype=np.float32))
-        cells.append((number * rows + cell[:, 1]) * columns + cell[:, 0])
-    return Points(
-        torch.from_numpy(np.concatenate(values)), torch.from_numpy(np.concatenate(cells)), len(releases), (rows, columns)
-    )
+        place = np.clip(release.keypoints, 0, np.array([width, height]) * (1 - 1e-6))
+        place = (place / CELL).astype(np.float32)  # (N, 2)
+        within = place - np.floor(place) - 0.5
+        settings = np.broadcast_to(known, (count, len(known)))
+        values.append(np.concatenate([candidates, within, _frames(release), settings], axis=1, dtype=np.float32))
+        places.append(place)
+        image.append(np.full(count, number))
+    told, where, which = (torch.from_numpy(np.concatenate(parts)) for parts in (values, places, image))
+    return Points(told, where, which, len(releases), (height, width))
 
 
 def _frames(release: Release) -> Floats:

@@ -23,9 +23,13 @@ def mirrored(release: Release, order: Indices) -> Release:
     TypeError
         if nothing is defined for this kind of release.
     """
+    return elsewhere(_rearranged(release, order))
+
+
+def elsewhere(release: Release) -> Release:
+    """The same release with its keypoints at their places in the mirrored photograph, for those who look at nothing else."""
     width = np.float32(release.size[0])
-    keypoints = np.stack([width - release.keypoints[:, 0], release.keypoints[:, 1]], axis=1)
-    return dataclasses.replace(_rearranged(release, order), keypoints=keypoints)
+    return dataclasses.replace(release, keypoints=np.stack([width - release.keypoints[:, 0], release.keypoints[:, 1]], axis=1))
 
 
 @singledispatch

@@ -23,13 +23,15 @@ from torch import Tensor, nn
 from attacks.inversion import weights
 from attacks.inversion.data import Example, Examples, Served, fitting_dictionaries, quantisation_error, quantise
 from attacks.inversion.encoding import Encoding, Points, encode, stack
+from attacks.inversion.learner import Learner
 from attacks.inversion.log import Log
-from attacks.inversion.loss import reconstruction_loss, ssim
-from attacks.inversion.network import Inverter, Shape, paint
+from attacks.inversion.loss import ssim
+from attacks.inversion.network import Inverter, Shape
+from attacks.inversion.painting import paint
 from attacks.inversion.plan import Plan, Training
 from attacks.inversion.team import Team, launch
 from bench import tensorfile
-from bench.device import pick_device, pick_dtype
+from bench.device import pick_device
 from bench.errors import UserError
 from bench.features.views import OnDemand, PhotographView, collect, photographs_of
 from bench.plugin import Asset, Defense, OneOf
@@ -177,36 +179,33 @@ def _checkpoint_path(out: Path) -> Path:
     return out.with_name(out.name + ".checkpoint")
 
 
-class _Trainer:
-    """Weights, their moving average, AdamW's state and the number of steps done: what a checkpoint holds."""
+class _Trainer(Learner):
+    """A learner with its share of the batches, and the checkpoint that it is resumed from."""
+
+    module: Inverter
 
     def __init__(self, team: Team, shape: Shape, training: Training, out: Path, meta: dict[str, Any], log: Log) -> None:
         torch.manual_seed(training.seed)
-        self.team, self.training, self.meta, self.log = team, training, meta, log
-        self.device = pick_device()
-        self.dtype = pick_dtype(self.device)
+        super().__init__(Inverter(shape), training)
+        self.team, self.meta, self.log = team, meta, log
         self.path = _checkpoint_path(out)
-        self.module = Inverter(shape).to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self.average = {name: value.clone() for name, value in self.module.state_dict().items()}
-        self.optimizer = torch.optim.AdamW(self.module.parameters(), training.rate, weight_decay=training.decay)
-        self.step = 0
         if self.path.is_file():
             self._restore()
 
     def start_from(self, trained: Inverter, candidates: int) -> None:
         """Take over a network for raw descriptors."""
         weights.start_from(self.module, trained, candidates)
-        self.average = {name: value.clone() for name, value in self.module.state_dict().items()}
+        self.remember()
 
-    def run(self, examples: Examples) -> Inverter:
+    def run(self, examples: Examples) -> nn.Module:
         """Train to the end and return the network with averaged weights."""
         if self.step == self.training.steps:
-            return self._averaged()
+            return self.averaged()
         with Progress("training", self.training.steps - self.step) as progress:
             started, before, smooth = time.monotonic(), self.step, math.nan
             shared = self.team.share(self.module)
             for points, photographs in self._batches(examples):
-                loss = self._advance(shared, points.to(self.device), photographs.to(self.device))
+                loss = self._advance(shared, points, photographs)
                 smooth = loss if math.isnan(smooth) else 0.98 * smooth + 0.02 * loss
                 speed = (self.step - before) * self.training.batch / (time.monotonic() - started)
                 self.log.scalars({"loss": loss, "rate": self.optimizer.param_groups[0]["lr"], "images/s": speed}, self.step)
@@ -214,7 +213,7 @@ class _Trainer:
                 if self.step % CHECKPOINT_EVERY == 0:
                     self._save()
         self._save()
-        return self._averaged()
+        return self.averaged()
 
     def _batches(self, examples: Examples) -> Iterator[tuple[Points, Tensor]]:
         """This process's parts of the batches from the next step on, some being made while one is used."""
@@ -234,33 +233,12 @@ class _Trainer:
                 yield ready
 
     def _advance(self, shared: nn.Module, points: Points, photographs: Tensor) -> float:
-        """One step of AdamW."""
-        warm, done = self.training.warmup, self.step
-        progress = (done - warm) / max(1, self.training.steps - warm)
-        factor = (done + 1) / warm if done < warm else 0.5 * (1 + math.cos(math.pi * progress))
-        for group in self.optimizer.param_groups:
-            group["lr"] = self.training.rate * factor
-        self.module.train()
-        with torch.autocast(self.device.type, self.dtype, enabled=self.dtype != torch.float32):
-            painted = shared(points)
-        loss = reconstruction_loss(painted, photographs)
-        self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(self.module.parameters(), 1.0)
-        self.optimizer.step()
-        self.step += 1
-        keep = min(self.training.average, self.step / (self.step + 9))  # short memory while weights still run away
-        for name, weight in self.module.state_dict().items():
-            if weight.is_floating_point():
-                self.average[name].lerp_(weight, 1 - keep)
-        value = self.team.mean(loss.detach())
+        """One step of the schedule. -> the loss of the whole batch"""
+        warm = self.training.warmup
+        value = self.team.mean(self.learn(points, photographs, (self.step - warm) / max(1, self.training.steps - warm), shared))
         if not math.isfinite(value):
             raise FloatingPointError(f"the loss is {value} at step {self.step}")
         return value
-
-    def _averaged(self) -> Inverter:
-        self.module.load_state_dict(self.average)
-        return self.module.eval()
 
     def _save(self) -> None:
         if not self.team.leads:
@@ -294,7 +272,7 @@ def to_batch(examples: Sequence[Example], slots: int, encoding: Encoding) -> tup
 
 
 def validate(
-    module: Inverter, examples: Examples, views: Sequence[PhotographView], slots: int, encoding: Encoding
+    module: nn.Module, examples: Examples, views: Sequence[PhotographView], slots: int, encoding: Encoding
 ) -> dict[str, float]:
     """Mean MAE, SSIM (where its window fits) and PSNR over whole views, under settings drawn with a fixed seed."""
     device, rng = pick_device(), np.random.default_rng(0)

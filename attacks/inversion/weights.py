@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import nn
 
 from attacks.inversion.network import Inverter, Shape
 from bench import fields, spec, tensorfile
@@ -34,7 +35,7 @@ class Network:
         return {field: _setting(text) for field, text in self.meta["serves"].items()}
 
 
-def save(path: Path, module: Inverter, shape: Shape, meta: dict[str, Any]) -> str:
+def save(path: Path, module: nn.Module, shape: Shape, meta: dict[str, Any]) -> str:
     """Write the weights in half precision and return the file's digest."""
     arrays = {
         name: value.detach().cpu().numpy().astype(np.float16)
