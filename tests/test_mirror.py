@@ -2,8 +2,11 @@
 
 import numpy as np
 import pytest
+import torch
 
-from attacks.inversion.mirror import mirrored
+from attacks.inversion.mirror import elsewhere, mirrored
+from attacks.inversion.network import Inverter, Shape
+from attacks.inversion.painting import painted
 from bench.datasets import photographs
 from bench.features.sift import Sift
 from bench.plugin import Extractor
@@ -66,3 +69,28 @@ def test_what_is_not_known_is_said():
     assert Extractor.mirror_order(Sift()) is None  # of an extractor that says nothing of it
     with pytest.raises(TypeError, match="not defined"):
         mirrored(Sift().extract(PIXELS), Sift().mirror_order())
+
+
+def test_what_is_painted_twice_is_the_same_of_the_mirrored_photograph(rng):
+    """Of a release and its mirror image comes one image and its mirror image. Not so of one alone (control)."""
+    torch.manual_seed(0)
+    module = Inverter(Shape(inputs=130, widths=(8, 8, 8))).eval()
+    raw = Sift().extract(PIXELS)
+    release = Descriptors(keypoints=raw.keypoints, size=raw.size, descriptors=raw.descriptors)
+    mirror = mirrored(release, Sift().mirror_order())
+    known = np.empty(0, np.float32)
+
+    def shown(one, other):
+        return painted(module, one, other, known, 1, "invariant")
+
+    np.testing.assert_allclose(shown(release, mirror), shown(mirror, release)[:, ::-1], atol=1e-6)
+    np.testing.assert_allclose(shown(release, mirror), (shown(release, None) + shown(mirror, None)[:, ::-1]) / 2, atol=1e-2)
+    assert np.abs(shown(release, None) - shown(mirror, None)[:, ::-1]).max() > 0.05
+
+
+def test_positions_are_mirrored_alone(rng):
+    raw = Sift().extract(PIXELS)
+    release = Descriptors(keypoints=raw.keypoints, size=raw.size, descriptors=raw.descriptors)
+    moved, whole = elsewhere(release), mirrored(release, Sift().mirror_order())
+    assert np.array_equal(moved.keypoints, whole.keypoints)
+    assert np.array_equal(moved.descriptors, release.descriptors)

@@ -2,8 +2,7 @@
 
 The photographs of `train/` that are in neither list are parted by name into three thirds. The dictionary is made from the first
 two thirds, the attacker's public database from the last. All networks start from one that was trained on raw descriptors of all
-photographs, at one rate and then at half of it. They are then trained equally long for their own releases, on the last third,
-which the dictionary does not know.
+photographs. They are then trained equally long for their own releases, on the last third, which the dictionary does not know.
 """
 
 from __future__ import annotations
@@ -17,16 +16,15 @@ from bench.public import ASSETS
 
 WORDS, PUBLIC_WORDS = 256_000, 128_000
 DEFENSES = ("none", "affine", "ldp")
-NARROW = "32,64,128,192,192"  # channels of the network for positions, so that all files together stay small
+NARROW = "48,96,160,160"  # channels of the network for positions, so that all files together stay small
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--work", type=Path, required=True, help="kept between runs; what is done is not done again")
-    parser.add_argument(
-        "--steps", type=int, default=1000, help="of the common start's last part; the first has four times as many"
-    )
+    parser.add_argument("--steps", type=int, default=8600, help="of the common start, each of 8 crops")
+    parser.add_argument("--own-steps", type=int, default=1500, help="of each network from there")
     args = parser.parse_args()
     folders = part(args.data, args.work / "photographs")
     for file, photographs, words in (("dictionary", "01", WORDS), ("public-database", "2", PUBLIC_WORDS)):
@@ -36,20 +34,19 @@ def main() -> None:
         shutil.copyfile(made, ASSETS / made.name)
     unseen = ["--validation", folders["tune"]]
     given = ["--images", folders["012"], *unseen]
-    first, start = args.work / "first.safetensors", args.work / "start.safetensors"
+    start = args.work / "start.safetensors"
     if not start.is_file():
-        run("train", "--defense", "none", *given, "--steps", 4 * args.steps, "--out", first)
-        run("train", "--defense", "none", *given, "--start", first, "--steps", args.steps, "--rate", 1e-3, "--out", start)
+        run("train", "--defense", "none", *given, "--steps", args.steps, "--out", start)
     for name in DEFENSES:
         network = args.work / f"inversion-{name}.safetensors"
         if not network.is_file():
-            own = ["--images", folders["2"], *unseen, "--start", start, "--steps", 6 * args.steps // 10, "--rate", 1e-3]
+            own = ["--images", folders["2"], *unseen, "--start", start, "--steps", args.own_steps, "--rate", 1e-3]
             run("train", "--defense", name, *own, "--out", network)
         shutil.copyfile(network, ASSETS / network.name)
     positions = args.work / "positions.safetensors"
     if not positions.is_file():
         shape = ["--encoding", "positions", "--widths", NARROW]
-        run("train", "--defense", "none", *given, *shape, "--steps", 4 * args.steps // 5, "--out", positions)
+        run("train", "--defense", "none", *given, *shape, "--steps", args.own_steps, "--out", positions)
     shutil.copyfile(positions, ASSETS / positions.name)
 
 

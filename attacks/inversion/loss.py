@@ -26,8 +26,8 @@ def window(side: int, device: torch.device) -> Tensor:
 def ssim(a: Tensor, b: Tensor) -> Tensor:
     """Mean structural similarity of one-channel images where the window fits, without sample covariance. (B, H, W) -> ()"""
     rows, columns = window(a.shape[1], a.device), window(a.shape[2], a.device)
-    maps = torch.stack([a, b, a * a, b * b, a * b])  # (5, B, H, W)
-    mean_a, mean_b, aa, bb, ab = rows @ maps @ columns.T
+    mean_b, bb = rows @ torch.stack([b, b * b]) @ columns.T  # apart from the others, for it needs no gradient in training
+    mean_a, aa, ab = rows @ torch.stack([a, a * a, a * b]) @ columns.T
     covariance, variances = ab - mean_a * mean_b, aa - mean_a**2 + bb - mean_b**2
     luminance = (2 * mean_a * mean_b + C1) / (mean_a**2 + mean_b**2 + C1)
     return (luminance * (2 * covariance + C2) / (variances + C2)).mean()

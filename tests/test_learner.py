@@ -1,0 +1,85 @@
+"""A step of training: what it changes, and how near it comes to the machine's rate of multiplying matrices."""
+
+import copy
+
+import numpy as np
+import pytest
+import torch
+from torch.utils.flop_counter import FlopCounterMode
+
+from attacks.inversion.encoding import Points, encode
+from attacks.inversion.learner import Learner
+from attacks.inversion.network import Inverter, Shape
+from attacks.inversion.plan import Training
+from bench.device import pick_dtype
+from bench.types import Descriptors
+
+BATCH, KEYPOINTS = 8, 600
+SIDE = 2048  # of the matrices whose product is the floor
+
+
+def batch(rng: np.random.Generator, count: int = BATCH) -> tuple[Points, torch.Tensor]:
+    releases = [
+        Descriptors(
+            keypoints=rng.uniform(0, 256, (KEYPOINTS, 2)).astype(np.float32),
+            size=(256, 256),
+            descriptors=rng.normal(size=(KEYPOINTS, 128)).astype(np.float32),
+        )
+        for _ in range(count)
+    ]
+    points = encode(releases, [np.empty(0, np.float32)] * count, 1, "invariant")
+    return points, torch.from_numpy(rng.random((count, 3, 256, 256)).astype(np.float32))
+
+
+def test_the_average_follows_the_weights_and_forgets_slowly(rng):
+    """After the first steps the average is what its rule makes of the weights that were seen."""
+    learner = Learner(Inverter(Shape(inputs=130, widths=(8, 8))), Training(steps=3, batch=1, warmup=1))
+    name = "own.weight"
+    expected = learner.module.state_dict()[name].clone()
+    for step in range(3):
+        learner.learn(*batch(rng, 1), done=step / 3)
+        keep = (step + 1) / (step + 10)
+        expected = keep * expected + (1 - keep) * learner.module.state_dict()[name]
+    torch.testing.assert_close(learner.average[name], expected)
+    last = copy.deepcopy(learner.module.state_dict()[name])
+    assert not torch.equal(learner.averaged().state_dict()[name], last)
+
+
+def test_the_rate_rises_and_then_falls_to_nothing(rng):
+    learner = Learner(Inverter(Shape(inputs=130, widths=(8, 8))), Training(steps=9, batch=1, warmup=2, rate=1e-3))
+    rates = []
+    for done in (-1.0, -0.5, 0.0, 0.5, 1.0):
+        learner.learn(*batch(rng, 1), done=done)
+        rates.append(learner.optimizer.param_groups[0]["lr"])
+    assert rates == pytest.approx([5e-4, 1e-3, 1e-3, 5e-4, 0])
+
+
+GROUP = pytest.mark.benchmark(group="a step of training")
+
+
+@GROUP
+def test_speed_of_a_step(benchmark, rng):
+    """Eight crops, forward and backward; 8 divided by the seconds is images a second."""
+    torch.manual_seed(0)
+    learner, given = Learner(Inverter(Shape(inputs=130)), Training()), batch(rng)
+    with FlopCounterMode(display=False) as counted:
+        learner.learn(*given, done=0)
+    benchmark.extra_info["operations"] = counted.get_total_flops()
+    benchmark(learner.learn, *given, done=0)
+
+
+@GROUP
+def test_speed_of_the_bare_products(benchmark, rng):
+    """The floor: the step's operations as products of large matrices in the same precision."""
+    torch.manual_seed(0)
+    learner, given = Learner(Inverter(Shape(inputs=130)), Training()), batch(rng)
+    with FlopCounterMode(display=False) as counted:
+        learner.learn(*given, done=0)
+    factor = torch.randn(SIDE, SIDE).to(pick_dtype(learner.device))
+    times = round(counted.get_total_flops() / (2 * SIDE**3))
+
+    def multiply() -> None:
+        for _ in range(times):
+            factor @ factor
+
+    benchmark(multiply)
