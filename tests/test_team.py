@@ -9,7 +9,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from torch import distributed, nn
 
 import attacks.inversion.train as inversion
-from attacks.inversion import learner, norm, weights
+from attacks.inversion import learner, norm, painting, weights
 from attacks.inversion.plan import PROFILES, Plan, Training
 from attacks.inversion.team import Team, launch
 from bench.cli import main
@@ -66,9 +66,14 @@ def losses(folder):
 
 
 def in_single_precision(*given):
-    """Train without half-precision's rounding, which grows from step to step."""
-    learner.pick_dtype = lambda device: torch.float32
+    """Train and paint without half-precision's rounding, which grows from step to step."""
+    learner.pick_dtype = painting.pick_dtype = lambda device: torch.float32
     return inversion.take_part(*given)
+
+
+def put_back(monkeypatch):
+    for module in (learner, painting):
+        monkeypatch.setattr(module, "pick_dtype", module.pick_dtype)
 
 
 def without_joint_norms(*given):
@@ -98,7 +103,7 @@ PROCESSES = {"one": (1, in_single_precision), "two": (2, in_single_precision), "
 
 def test_two_processes_train_as_one_with_the_joint_batch(tmp_path, monkeypatch):
     """The same loss at every step, the same scores. Not so if each process normalises its own part (control)."""
-    monkeypatch.setattr(learner, "pick_dtype", learner.pick_dtype)  # to put it back
+    put_back(monkeypatch)
     found = {}
     for name, (devices, how) in PROCESSES.items():
         meta = launch(devices, SHORT.batch, how, *asked(tmp_path, name))
@@ -113,7 +118,7 @@ def test_two_processes_train_as_one_with_the_joint_batch(tmp_path, monkeypatch):
 
 
 def test_two_processes_go_on_from_what_one_left(tmp_path, monkeypatch):
-    monkeypatch.setattr(learner, "pick_dtype", learner.pick_dtype)
+    put_back(monkeypatch)
     monkeypatch.setattr(inversion, "CHECKPOINT_EVERY", 1)
     advance = inversion._Trainer._advance
 

@@ -24,7 +24,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--work", type=Path, required=True, help="kept between runs; what is done is not done again")
     parser.add_argument("--steps", type=int, default=8600, help="of the common start, each of 8 crops")
-    parser.add_argument("--own-steps", type=int, default=1500, help="of each network from there")
+    parser.add_argument("--own-steps", type=int, default=800, help="of each network from there")
     args = parser.parse_args()
     folders = part(args.data, args.work / "photographs")
     for file, photographs, words in (("dictionary", "01", WORDS), ("public-database", "2", PUBLIC_WORDS)):
