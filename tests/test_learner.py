@@ -57,26 +57,30 @@ def test_the_rate_rises_and_then_falls_to_nothing(rng):
 GROUP = pytest.mark.benchmark(group="a step of training")
 
 
-@GROUP
-def test_speed_of_a_step(benchmark, rng):
-    """Eight crops, forward and backward; 8 divided by the seconds is images a second."""
+@pytest.fixture
+def ready(rng):
+    """A learner, a batch, and the operations of a step."""
     torch.manual_seed(0)
     learner, given = Learner(Inverter(Shape(inputs=130)), Training()), batch(rng)
     with FlopCounterMode(display=False) as counted:
         learner.learn(*given, done=0)
-    benchmark.extra_info["operations"] = counted.get_total_flops()
+    return learner, given, counted.get_total_flops()
+
+
+@GROUP
+def test_speed_of_a_step(benchmark, ready):
+    """Eight crops, forward and backward; 8 divided by the seconds is images a second."""
+    learner, given, operations = ready
+    benchmark.extra_info["operations"] = operations
     benchmark(learner.learn, *given, done=0)
 
 
 @GROUP
-def test_speed_of_the_bare_products(benchmark, rng):
+def test_speed_of_the_bare_products(benchmark, ready):
     """The floor: the step's operations as products of large matrices in the same precision."""
-    torch.manual_seed(0)
-    learner, given = Learner(Inverter(Shape(inputs=130)), Training()), batch(rng)
-    with FlopCounterMode(display=False) as counted:
-        learner.learn(*given, done=0)
+    learner, _, operations = ready
     factor = torch.randn(SIDE, SIDE).to(pick_dtype(learner.device))
-    times = round(counted.get_total_flops() / (2 * SIDE**3))
+    times = round(operations / (2 * SIDE**3))
 
     def multiply() -> None:
         for _ in range(times):
