@@ -1,7 +1,5 @@
 """A step of training: what it changes, and how near it comes to the machine's rate of multiplying matrices."""
 
-import copy
-
 import numpy as np
 import pytest
 import torch
@@ -41,7 +39,7 @@ def test_the_average_follows_the_weights_and_forgets_slowly(rng):
         keep = (step + 1) / (step + 10)
         expected = keep * expected + (1 - keep) * learner.module.state_dict()[name]
     torch.testing.assert_close(learner.average[name], expected)
-    last = copy.deepcopy(learner.module.state_dict()[name])
+    last = learner.module.state_dict()[name].clone()
     assert not torch.equal(learner.averaged().state_dict()[name], last)
 
 

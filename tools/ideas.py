@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-import math
 import pickle
 import time
 from collections.abc import Sequence
@@ -34,7 +33,7 @@ from attacks.inversion.mirror import mirrored
 from attacks.inversion.network import Inverter, Shape
 from attacks.inversion.painting import painted
 from attacks.inversion.plan import Training
-from attacks.inversion.train import to_batch, validate
+from attacks.inversion.train import scored, to_batch, validate
 from bench.datasets.photographs import folder
 from bench.features.sift import Sift
 from bench.features.views import PhotographView, collect
@@ -251,9 +250,8 @@ def painted_twice(network: nn.Module, order: Indices, views: Sequence[Photograph
         raw = view.features
         release = Descriptors(keypoints=raw.keypoints, size=raw.size, descriptors=raw.descriptors)
         image = painted(network, release, mirrored(release, order), np.empty(0, np.float32), 1, "invariant")
-        made, truth = torch.from_numpy(image).permute(2, 0, 1), torch.from_numpy(view.pixels).permute(2, 0, 1) / 255
-        scores.append((float(ssim(made, truth)), -10 * math.log10(float((made - truth).square().mean()))))
-    similarity, psnr = np.mean(scores, axis=0)
+        scores.append(scored(*(torch.from_numpy(pixels).permute(2, 0, 1) for pixels in (image, view.pixels / np.float32(255)))))
+    _, similarity, psnr = np.mean(scores, axis=0)
     return {"ssim": float(similarity), "psnr": float(psnr)}
 
 

@@ -279,8 +279,12 @@ def validate(
     scores = []
     for view in views:
         points, truth = to_batch([examples.whole(view, rng)], slots, encoding)
-        painted = paint(module, points.to(device)).cpu()
-        mse = float((painted - truth).square().mean())
-        scores.append((float((painted - truth).abs().mean()), float(ssim(painted[0], truth[0])), -10 * math.log10(mse)))
+        scores.append(scored(paint(module, points.to(device)).cpu()[0], truth[0]))
     mae, similarity, psnr = np.mean(scores, axis=0)
     return {"photographs": len(views), "mae": float(mae), "ssim": float(similarity), "psnr": float(psnr)}
+
+
+def scored(painted: Tensor, photograph: Tensor) -> tuple[float, float, float]:
+    """MAE, SSIM (where its window fits) and PSNR of one image, (3, H, W) both."""
+    error = painted - photograph
+    return float(error.abs().mean()), float(ssim(painted, photograph)), -10 * math.log10(float(error.square().mean()))
