@@ -48,7 +48,7 @@ def test_the_rate_rises_and_then_falls_to_nothing(rng):
     rates = []
     for done in (-1.0, -0.5, 0.0, 0.5, 1.0):
         learner.learn(*batch(rng, 1), done=done)
-        rates.append(learner.optimizer.param_groups[0]["lr"])
+        rates.append(learner.optimizer.rate)
     assert rates == pytest.approx([5e-4, 1e-3, 1e-3, 5e-4, 0])
 
 

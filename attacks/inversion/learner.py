@@ -1,4 +1,4 @@
-"""A network that learns: its weights, their moving average, and AdamW's state."""
+"""A network that learns: its weights, their moving average, and the optimizer's state."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from attacks.inversion.encoding import Points
 from attacks.inversion.loss import reconstruction_loss
+from attacks.inversion.optimizer import Optimizer
 from attacks.inversion.plan import Training
 from bench.device import pick_device, pick_dtype
 
@@ -24,7 +25,7 @@ class Learner:
         self.device = pick_device()
         self.dtype = pick_dtype(self.device)
         self.module = module.to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self.optimizer = torch.optim.AdamW(self.module.parameters(), training.rate, weight_decay=training.decay)
+        self.optimizer = Optimizer(self.module, training.rate, training.decay)
         self.step = 0
         self.remember()
 
@@ -37,13 +38,12 @@ class Learner:
         of the network where several processes share the batch. -> ()"""
         warm = self.training.warmup
         factor = (self.step + 1) / warm if self.step < warm else 0.5 * (1 + math.cos(math.pi * done))
-        for group in self.optimizer.param_groups:
-            group["lr"] = self.training.rate * factor
+        self.optimizer.rate = self.training.rate * factor
         self.module.train()
         with torch.autocast(self.device.type, self.dtype, enabled=self.dtype != torch.float32):
             painted = (shared or self.module)(points.to(self.device))
         loss = self.loss(painted, photographs.to(self.device))
-        self.optimizer.zero_grad(set_to_none=True)
+        self.optimizer.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self.module.parameters(), 1.0)
         self.optimizer.step()

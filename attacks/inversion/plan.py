@@ -20,9 +20,9 @@ class Training:
 
     steps: int = 4000
     batch: int = 8
-    rate: float = 2e-3  # AdamW's learning rate at its peak; cosine to zero
+    rate: float = 4e-3  # the learning rate at its peak; cosine to zero
     warmup: int = 100  # steps
-    decay: float = 0.02  # AdamW's weight decay
+    decay: float = 0.02  # of the weights
     average: float = 0.998  # decay of the moving average of the weights
     seed: int = 0
 

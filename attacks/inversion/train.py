@@ -208,7 +208,7 @@ class _Trainer(Learner):
                 loss = self._advance(shared, points, photographs)
                 smooth = loss if math.isnan(smooth) else 0.98 * smooth + 0.02 * loss
                 speed = (self.step - before) * self.training.batch / (time.monotonic() - started)
-                self.log.scalars({"loss": loss, "rate": self.optimizer.param_groups[0]["lr"], "images/s": speed}, self.step)
+                self.log.scalars({"loss": loss, "rate": self.optimizer.rate, "images/s": speed}, self.step)
                 progress.advance(1, f"loss {smooth:.4f}, {speed:.1f} images/s")
                 if self.step % CHECKPOINT_EVERY == 0:
                     self._save()
@@ -245,23 +245,20 @@ class _Trainer(Learner):
             return
         arrays = {f"weights/{name}": value.cpu().numpy() for name, value in self.module.state_dict().items()}
         arrays |= {f"average/{name}": value.cpu().numpy() for name, value in self.average.items()}
-        for index, state in self.optimizer.state_dict()["state"].items():
-            arrays |= {f"adamw/{index}/{name}": value.cpu().numpy() for name, value in state.items()}
+        arrays |= {f"moments/{name}": value.cpu().numpy() for name, value in self.optimizer.state().items()}
         tensorfile.save(self.path, CHECKPOINT, arrays, {**self.meta, "step": self.step})
 
     def _restore(self) -> None:
         arrays, meta, _ = tensorfile.load(self.path, CHECKPOINT)
         self.step = meta.pop("step")
         _same_training(self.path, meta, self.meta)
-        tensors = {name: torch.from_numpy(array.copy()) for name, array in arrays.items()}
-        self.module.load_state_dict({name[8:]: value for name, value in tensors.items() if name.startswith("weights/")})
-        self.average = {name[8:]: value.to(self.device) for name, value in tensors.items() if name.startswith("average/")}
-        state = self.optimizer.state_dict()
-        state["state"] = {
-            index: {key: tensors[f"adamw/{index}/{key}"] for key in ("step", "exp_avg", "exp_avg_sq")}
-            for index in range(len(list(self.module.parameters())))
-        }
-        self.optimizer.load_state_dict(state)
+        kept: dict[str, dict[str, Tensor]] = {"weights": {}, "average": {}, "moments": {}}
+        for name, array in arrays.items():
+            kind, rest = name.split("/", 1)
+            kept[kind][rest] = torch.from_numpy(array.copy())
+        self.module.load_state_dict(kept["weights"])
+        self.average = {name: value.to(self.device) for name, value in kept["average"].items()}
+        self.optimizer.restore(kept["moments"])
 
 
 def to_batch(examples: Sequence[Example], slots: int, encoding: Encoding) -> tuple[Points, Tensor]:

@@ -1,0 +1,67 @@
+"""Muon for matrices, AdamW for the rest.
+
+Muon (Jordan et al., 2024; Liu et al., arXiv 2502.16982) moves a matrix by the nearest orthogonal one to its averaged gradient, so
+that no direction waits for others. A convolution is the matrix of its outputs by all that one of them reads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor, nn
+
+
+class Optimizer:
+    """Both at one rate: Muon's updates are scaled to be as large as AdamW's usually are."""
+
+    def __init__(self, module: nn.Module, rate: float, decay: float) -> None:
+        weights = dict(module.named_parameters())
+        self.shaped = {name: weight for name, weight in weights.items() if weight.ndim > 1}
+        self.matrices = {name: matrix(weight.detach()) for name, weight in self.shaped.items()}
+        self.others: dict[str, Tensor] = {name: weight for name, weight in weights.items() if weight.ndim <= 1}
+        self.muon = torch.optim.Muon(self.matrices.values(), rate, weight_decay=decay, adjust_lr_fn="match_rms_adamw")
+        self.adamw = torch.optim.AdamW(self.others.values(), rate, weight_decay=decay)
+        self.parts = (self.matrices, self.muon), (self.others, self.adamw)
+
+    @property
+    def rate(self) -> float:
+        """The learning rate."""
+        return float(self.muon.param_groups[0]["lr"])
+
+    @rate.setter
+    def rate(self, rate: float) -> None:
+        for group in self.muon.param_groups + self.adamw.param_groups:
+            group["lr"] = rate
+
+    def zero_grad(self) -> None:
+        """Forget the gradients."""
+        for weight in (*self.shaped.values(), *self.others.values()):
+            weight.grad = None
+
+    def step(self) -> None:
+        """Move all weights that have a gradient."""
+        for name, weight in self.shaped.items():
+            self.matrices[name].grad = None if weight.grad is None else matrix(weight.grad)
+        self.muon.step()
+        self.adamw.step()
+
+    def state(self) -> dict[str, Tensor]:
+        """What `restore` takes: the moments of each weight, by its name."""
+        kept = {name: optimizer.state[weight] for weights, optimizer in self.parts for name, weight in weights.items()}
+        return {f"{name}/{key}": value for name, moments in kept.items() for key, value in moments.items()}
+
+    def restore(self, state: Mapping[str, Tensor]) -> None:
+        """Go on from what `state` gave."""
+        for weights, optimizer in self.parts:
+            whole = optimizer.state_dict()
+            whole["state"] = {
+                index: {key.removeprefix(f"{name}/"): value for key, value in state.items() if key.startswith(f"{name}/")}
+                for index, name in enumerate(weights)
+            }
+            optimizer.load_state_dict(whole)
+
+
+def matrix(weight: Tensor) -> Tensor:
+    """A view of a weight as (outputs, all that one reads); of convolutions that are kept channels last, or 1 x 1."""
+    return weight if weight.ndim == 2 else weight.permute(0, 2, 3, 1).view(len(weight), -1)

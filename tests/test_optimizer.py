@@ -1,0 +1,101 @@
+"""Muon for matrices, AdamW for the rest."""
+
+import pytest
+import torch
+from torch import nn
+
+from attacks.inversion.optimizer import Optimizer
+
+RATE, DECAY = 0.01, 0.1
+
+
+@pytest.fixture
+def module():
+    torch.manual_seed(0)
+    layers = nn.Sequential(nn.Conv2d(4, 6, 3), nn.BatchNorm2d(6), nn.Conv2d(6, 5, 1), nn.Flatten(), nn.Linear(5 * 9, 3))
+    return layers.to(memory_format=torch.channels_last)
+
+
+def forget_and_learn(module, optimizer, seed):
+    images = torch.randn(7, 4, 5, 5, generator=torch.Generator().manual_seed(seed))
+    optimizer.zero_grad()
+    (module(images) ** 2).sum().backward()
+    optimizer.step()
+
+
+def before_and_after(module, optimizer):
+    """Weights before a step, gradients, weights after it."""
+    before = {name: weight.detach().clone() for name, weight in module.named_parameters()}
+    forget_and_learn(module, optimizer, 0)
+    named = dict(module.named_parameters())
+    return before, {name: weight.grad.clone() for name, weight in named.items()}, {name: w.detach() for name, w in named.items()}
+
+
+def test_each_direction_of_a_matrix_moves_equally_far(module):
+    """Also of a convolution; the gradient's own directions differ a hundredfold (control)."""
+    before, gradients, after = before_and_after(module, Optimizer(module, RATE, decay=0.0))
+    for name in ("0.weight", "2.weight", "4.weight"):
+        moved, gradient = (kind[name].flatten(1) for kind in (before, gradients))
+        moved = (before[name] - after[name]).flatten(1)
+        lengths = torch.linalg.svdvals(moved) / (0.2 * RATE * max(moved.shape) ** 0.5)
+        assert lengths.min() > 0.6 and lengths.max() < 1.3
+        of_gradient = torch.linalg.svdvals(gradient)
+        assert of_gradient.max() > 5 * of_gradient.min()
+
+
+def test_a_convolution_moves_as_the_matrix_that_it_is(module):
+    """PyTorch's Muon of that matrix, in the order of columns that flattening gives, is the reference."""
+    before, gradients, after = before_and_after(module, Optimizer(module, RATE, DECAY))
+    for name in ("0.weight", "2.weight", "4.weight"):
+        reference = nn.Parameter(before[name].flatten(1).clone())
+        reference.grad = gradients[name].flatten(1).clone()
+        torch.optim.Muon([reference], RATE, weight_decay=DECAY, adjust_lr_fn="match_rms_adamw").step()
+        torch.testing.assert_close(after[name].flatten(1), reference.detach(), rtol=0, atol=0.02 * RATE)  # it rounds to bf16
+        assert (after[name] - before[name]).abs().max() > 0.1 * RATE
+
+
+def test_what_is_no_matrix_moves_by_adamw(module):
+    before, gradients, after = before_and_after(module, Optimizer(module, RATE, DECAY))
+    for name in ("0.bias", "1.weight", "1.bias", "4.bias"):
+        reference = nn.Parameter(before[name].clone())
+        reference.grad = gradients[name].clone()
+        torch.optim.AdamW([reference], RATE, weight_decay=DECAY).step()
+        torch.testing.assert_close(after[name], reference.detach())
+
+
+@pytest.mark.parametrize("restored", [True, False])
+def test_what_goes_on_from_a_state_is_the_same(module, restored):
+    """Without the state it is not (control)."""
+    optimizer = Optimizer(module, RATE, DECAY)
+    for seed in range(3):
+        forget_and_learn(module, optimizer, seed)
+    weights = {name: value.clone() for name, value in module.state_dict().items()}
+    state = {name: value.clone() for name, value in optimizer.state().items()}
+    forget_and_learn(module, optimizer, 3)
+    expected = {name: value.clone() for name, value in module.state_dict().items()}
+
+    module.load_state_dict(weights)
+    again = Optimizer(module, RATE, DECAY)
+    if restored:
+        again.restore(state)
+    forget_and_learn(module, again, 3)
+    same = [torch.equal(value, expected[name]) for name, value in module.state_dict().items() if name.endswith(("weight", "bias"))]
+    assert all(same) == restored
+    assert restored or not any(same)
+
+
+def test_the_rate_is_that_of_both(module):
+    optimizer = Optimizer(module, RATE, DECAY)
+    optimizer.rate = 0.0
+    before, _, after = before_and_after(module, optimizer)
+    assert optimizer.rate == 0
+    for name, weight in before.items():
+        torch.testing.assert_close(after[name], weight, rtol=0, atol=0)
+
+
+def test_a_weight_without_gradient_stays(module):
+    optimizer = Optimizer(module, RATE, DECAY)
+    module[0].requires_grad_(False)
+    before, after = module[0].weight.clone(), module[0].weight
+    forget_and_learn(module, optimizer, 0)
+    assert torch.equal(before, after)
