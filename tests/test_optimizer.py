@@ -79,7 +79,9 @@ def test_what_goes_on_from_a_state_is_the_same(module, restored):
     if restored:
         again.restore(state)
     forget_and_learn(module, again, 3)
-    same = [torch.equal(value, expected[name]) for name, value in module.state_dict().items() if name.endswith(("weight", "bias"))]
+    same = [
+        torch.equal(value, expected[name]) for name, value in module.state_dict().items() if name.endswith(("weight", "bias"))
+    ]
     assert all(same) == restored
     assert restored or not any(same)
 

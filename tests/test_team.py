@@ -96,7 +96,7 @@ def asked(folder, name):
     return plan, folder / name, folder / f"log-{name}"
 
 
-# AdamW's first steps are signs of gradients, which rounding turns where they are small: at a low rate it does little.
+# First steps are signs of gradients, or orthogonal: rounding turns what is small in gradients, which does little at a low rate.
 SHORT = Training(steps=4, batch=4, warmup=2, rate=1e-4)
 PROCESSES = {"one": (1, in_single_precision), "two": (2, in_single_precision), "apart": (2, without_joint_norms)}
 

@@ -19,13 +19,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 import torch.nn.functional as nnf
 from make_assets import part
 from torch import Tensor, nn
 
-from attacks.inversion.data import Examples
+from attacks.inversion.data import Example, Examples
 from attacks.inversion.encoding import CELL, Points
 from attacks.inversion.learner import Learner
 from attacks.inversion.loss import LUMA, WEIGHT, ssim
@@ -55,14 +56,27 @@ INPUTS = 128 + 2  # a raw descriptor, and the place within a cell
 # ---- losses
 
 
-def loss(painted: Tensor, photograph: Tensor, dissimilarity: float, l1: float, rmse: float, psnr: float, coarse: float) -> Tensor:
-    """A weighted sum: 1 - SSIM of luminance, L1, root and logarithm of each image's square error, L1 of four coarser scales."""
+def loss(
+    painted: Tensor,
+    photograph: Tensor,
+    dissimilarity: float,
+    l1: float,
+    rmse: float,
+    psnr: float,
+    coarse: float,
+    gradient: float,
+) -> Tensor:
+    """A weighted sum: 1 - SSIM of luminance, L1, root and logarithm of each image's square error, L1 of four coarser scales and
+    of differences between neighbouring pixels."""
     luma = torch.tensor(LUMA, device=painted.device).view(1, 3, 1, 1)
     total = dissimilarity * (1 - ssim((painted * luma).sum(dim=1), (photograph * luma).sum(dim=1)))
     total = total + l1 * (painted - photograph).abs().mean()
     if rmse or psnr:
         mse = (painted - photograph).square().mean(dim=(1, 2, 3)) + 1e-4
         total = total + rmse * mse.sqrt().mean() + psnr * mse.log().mean()
+    if gradient:
+        error = painted - photograph
+        total = total + gradient * sum(error.diff(dim=axis).abs().mean() for axis in (2, 3))
     if coarse:
         for _ in range(4):
             painted, photograph = nnf.avg_pool2d(painted, 2), nnf.avg_pool2d(photograph, 2)
@@ -136,6 +150,41 @@ def nearest(image: Tensor, place: Tensor, count: int) -> tuple[Tensor, Tensor]:
     return near, torch.cat(shapes, dim=2)
 
 
+# ---- more photographs from fewer
+
+
+def zoomed(example: Example, share: float, rng: np.random.Generator) -> Example:
+    """Some square within the crop, its side at least `share` of the crop's, as large as the crop was. A descriptor is of the
+    keypoint's own scale, so that it stays nearly the same."""
+    side = len(example.pixels)
+    window = int(rng.integers(round(share * side), side + 1))
+    left, top = rng.integers(side - window + 1, size=2)
+    moved = (example.release.keypoints - np.array([left, top], dtype=np.float32)) * np.float32(side / window)
+    inside = np.all((moved >= 0) & (moved < side), axis=1)
+    if not inside.any():
+        return example
+    seen = example.pixels[top : top + window, left : left + window]
+    pixels = np.asarray(cv2.resize(seen, (side, side), interpolation=cv2.INTER_CUBIC), dtype=np.uint8)
+    assert isinstance(example.release, Descriptors)
+    release = dataclasses.replace(
+        example.release, keypoints=moved[inside], descriptors=example.release.descriptors[inside], frames=None
+    )
+    return dataclasses.replace(example, pixels=pixels, release=release)
+
+
+def relit(example: Example, most: float, rng: np.random.Generator) -> Example:
+    """Brighter or darker, of more or less contrast, up to a share: descriptors of normed gradients stay the same."""
+    contrast, brightness = 1 + rng.uniform(-most, most), rng.uniform(-most, most)
+    pixels = np.clip((example.pixels / 255 - 0.5) * contrast + 0.5 + brightness, 0, 1)
+    return dataclasses.replace(example, pixels=np.round(255 * pixels).astype(np.uint8))
+
+
+def thinned(points: Points, share: float, rng: np.random.Generator) -> Points:
+    """Without a share of the keypoints."""
+    kept = torch.from_numpy(rng.random(len(points.image)) >= share)
+    return dataclasses.replace(points, **{name: getattr(points, name)[kept] for name in ("values", "places", "image")})
+
+
 # ---- ideas
 
 
@@ -149,6 +198,8 @@ class Idea:
     training: dict[str, Any] = field(default_factory=dict)
     photographs: int = 800
     dropped: float = 0.0  # share of keypoints
+    zoomed: float = 1.0  # least share of a crop's side that is looked at
+    relit: float = 0.0  # share of the range by which brightness and contrast change, at most
     upright: bool = True
 
     def network(self) -> Inverter:
@@ -158,13 +209,19 @@ class Idea:
     def measured(self, painted: Tensor, photograph: Tensor) -> Tensor:
         return loss(painted, photograph, **AS_IT_IS | self.loss)
 
+    def drawn(self, examples: Examples, rng: np.random.Generator) -> Example:
+        example = examples.draw(rng)
+        example = zoomed(example, self.zoomed, rng) if self.zoomed < 1 else example
+        return relit(example, self.relit, rng) if self.relit else example
 
-AS_IT_IS = {"dissimilarity": WEIGHT, "l1": 1.0, "rmse": 0.0, "psnr": 0.0, "coarse": 0.0}
+
+AS_IT_IS = {"dissimilarity": WEIGHT, "l1": 1.0, "rmse": 0.0, "psnr": 0.0, "coarse": 0.0, "gradient": 0.0}
 IDEAS = {
     UNCHANGED: Idea(),
     "loss: rmse for l1": Idea(loss={"l1": 0.0, "rmse": 1.0}),
     "loss: psnr beside l1": Idea(loss={"psnr": 0.05}),
     "loss: coarser scales": Idea(loss={"coarse": 0.25}),
+    "loss: gradients": Idea(loss={"gradient": 0.5}),
     "loss: more ssim": Idea(loss={"dissimilarity": 0.6}),
     "rate 8e-3": Idea(training={"rate": 8e-3}),
     "rate 2e-3": Idea(training={"rate": 2e-3}),
@@ -178,6 +235,8 @@ IDEAS = {
     "patches of 10": Idea(shape={"patch": 10}),
     "patches of 2": Idea(shape={"patch": 2}),
     "keypoint dropout": Idea(dropped=0.2),
+    "zoomed": Idea(zoomed=0.7),
+    "brightness and contrast": Idea(relit=0.1),
     "attention": Idea(attention=2),
     "200 photographs": Idea(photographs=200),
     "400 photographs": Idea(photographs=400),
@@ -232,11 +291,8 @@ def fit(learner: Learner, examples: Examples, idea: Idea, seconds: float) -> int
     with Progress("training", round(seconds)) as progress:
         while (share := (time.process_time() - started) / seconds) < 1:
             rng = np.random.default_rng([0, learner.step])
-            points, photographs = to_batch([examples.draw(rng) for _ in range(learner.training.batch)], 1, "invariant")
-            if idea.dropped:
-                kept = torch.from_numpy(rng.random(len(points.image)) >= idea.dropped)
-                rest = {name: getattr(points, name)[kept] for name in ("values", "places", "image")}
-                points = dataclasses.replace(points, **rest)
+            points, photographs = to_batch([idea.drawn(examples, rng) for _ in range(learner.training.batch)], 1, "invariant")
+            points = thinned(points, idea.dropped, rng) if idea.dropped else points
             value = float(learner.learn(points, photographs, share))
             progress.advance(int(seconds * share) - told, f"loss {value:.4f}, {learner.step} steps")
             told = int(seconds * share)
@@ -274,7 +330,7 @@ def page(records: Sequence[dict[str, Any]]) -> str:
         "Written by `tools/ideas.py`, which says what each idea is. Raw descriptors; every training from random weights, in "
         "equal processor time; scores on the 100 photographs of `tune.txt` (SSIM where its window fits). Short trainings favour "
         "what learns fast, and each was done once: read small differences as none. *Twice*: painted of the release and "
-        "of that of the mirrored photograph, and averaged. *Earlier*: another layout of the network, which the history of "
+        "of that of the mirrored photograph, and averaged. *Earlier*: another layout or optimizer, which the history of "
         "`tools/ideas.py` has. What was trained longest is the start of all shipped networks, by `bench train` on two cores.",
     ]
     groups = sorted({(not record["upright"], record["seconds"]) for record in records})

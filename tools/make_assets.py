@@ -3,6 +3,7 @@
 The photographs of `train/` that are in neither list are parted by name into three thirds. The dictionary is made from the first
 two thirds, the attacker's public database from the last. All networks start from one that was trained on raw descriptors of all
 photographs. They are then trained equally long for their own releases, on the last third, which the dictionary does not know.
+Two networks start from nothing: of positions alone, and of raw oriented descriptors.
 """
 
 from __future__ import annotations
@@ -23,8 +24,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--work", type=Path, required=True, help="kept between runs; what is done is not done again")
-    parser.add_argument("--steps", type=int, default=8600, help="of the common start, each of 8 crops")
-    parser.add_argument("--own-steps", type=int, default=800, help="of each network from there")
+    parser.add_argument("--steps", type=int, default=5000, help="of the common start, each of 8 crops")
+    parser.add_argument("--own-steps", type=int, default=800, help="of each network from there, and of that for positions")
+    parser.add_argument("--oriented-steps", type=int, default=3000, help="of the network for oriented descriptors")
     args = parser.parse_args()
     folders = part(args.data, args.work / "photographs")
     for file, photographs, words in (("dictionary", "01", WORDS), ("public-database", "2", PUBLIC_WORDS)):
@@ -40,14 +42,18 @@ def main() -> None:
     for name in DEFENSES:
         network = args.work / f"inversion-{name}.safetensors"
         if not network.is_file():
-            own = ["--images", folders["2"], *unseen, "--start", start, "--steps", args.own_steps, "--rate", 1e-3]
+            own = ["--images", folders["2"], *unseen, "--start", start, "--steps", args.own_steps, "--rate", 2e-3]
             run("train", "--defense", name, *own, "--out", network)
         shutil.copyfile(network, ASSETS / network.name)
-    positions = args.work / "positions.safetensors"
-    if not positions.is_file():
-        shape = ["--encoding", "positions", "--widths", NARROW]
-        run("train", "--defense", "none", *given, *shape, "--steps", args.own_steps, "--out", positions)
-    shutil.copyfile(positions, ASSETS / positions.name)
+    alone = {
+        "positions": ["--encoding", "positions", "--widths", NARROW, "--steps", args.own_steps],
+        "inversion-oriented": ["--extractor", "sift:upright=false", "--steps", args.oriented_steps],
+    }
+    for name, options in alone.items():
+        network = args.work / f"{name}.safetensors"
+        if not network.is_file():
+            run("train", "--defense", "none", *given, *options, "--out", network)
+        shutil.copyfile(network, ASSETS / network.name)
 
 
 def part(data: Path, work: Path) -> dict[str, Path]:

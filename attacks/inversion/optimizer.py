@@ -16,10 +16,9 @@ class Optimizer:
     """Both at one rate: Muon's updates are scaled to be as large as AdamW's usually are."""
 
     def __init__(self, module: nn.Module, rate: float, decay: float) -> None:
-        weights = dict(module.named_parameters())
-        self.shaped = {name: weight for name, weight in weights.items() if weight.ndim > 1}
-        self.matrices = {name: matrix(weight.detach()) for name, weight in self.shaped.items()}
-        self.others: dict[str, Tensor] = {name: weight for name, weight in weights.items() if weight.ndim <= 1}
+        self.weights: dict[str, Tensor] = dict(module.named_parameters())
+        self.matrices = {name: matrix(weight.detach()) for name, weight in self.weights.items() if weight.ndim > 1}
+        self.others = {name: weight for name, weight in self.weights.items() if name not in self.matrices}
         self.muon = torch.optim.Muon(self.matrices.values(), rate, weight_decay=decay, adjust_lr_fn="match_rms_adamw")
         self.adamw = torch.optim.AdamW(self.others.values(), rate, weight_decay=decay)
         self.parts = (self.matrices, self.muon), (self.others, self.adamw)
@@ -36,13 +35,14 @@ class Optimizer:
 
     def zero_grad(self) -> None:
         """Forget the gradients."""
-        for weight in (*self.shaped.values(), *self.others.values()):
+        for weight in self.weights.values():
             weight.grad = None
 
     def step(self) -> None:
         """Move all weights that have a gradient."""
-        for name, weight in self.shaped.items():
-            self.matrices[name].grad = None if weight.grad is None else matrix(weight.grad)
+        for name, view in self.matrices.items():
+            gradient = self.weights[name].grad
+            view.grad = None if gradient is None else matrix(gradient)
         self.muon.step()
         self.adamw.step()
 

@@ -58,5 +58,5 @@ class Profile:
 PROFILES = {
     "cpu": Profile(),
     # The paper's network and about as many photographs as it had, each seen 40 times: days of a GPU.
-    "paper": Profile(widths=COARSENET, training=Training(steps=125_000, batch=32, rate=1e-3, warmup=1000, average=0.9998)),
+    "paper": Profile(widths=COARSENET, training=Training(steps=125_000, batch=32, rate=2e-3, warmup=1000, average=0.9998)),
 }
