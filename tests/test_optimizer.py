@@ -7,6 +7,7 @@ from torch import nn
 from attacks.inversion.optimizer import Optimizer
 
 RATE, DECAY = 0.01, 0.1
+MATRICES = "0.weight", "2.weight", "4.weight"
 
 
 @pytest.fixture
@@ -31,22 +32,22 @@ def before_and_after(module, optimizer):
     return before, {name: weight.grad.clone() for name, weight in named.items()}, {name: w.detach() for name, w in named.items()}
 
 
-def test_each_direction_of_a_matrix_moves_equally_far(module):
-    """Also of a convolution; the gradient's own directions differ a hundredfold (control)."""
+def test_each_direction_of_a_matrix_moves_about_equally_far(module):
+    """Also of a convolution. The gradient's own directions differ more than that (control)."""
     before, gradients, after = before_and_after(module, Optimizer(module, RATE, decay=0.0))
-    for name in ("0.weight", "2.weight", "4.weight"):
-        moved, gradient = (kind[name].flatten(1) for kind in (before, gradients))
-        moved = (before[name] - after[name]).flatten(1)
-        lengths = torch.linalg.svdvals(moved) / (0.2 * RATE * max(moved.shape) ** 0.5)
-        assert lengths.min() > 0.6 and lengths.max() < 1.3
-        of_gradient = torch.linalg.svdvals(gradient)
-        assert of_gradient.max() > 5 * of_gradient.min()
+    for name in MATRICES:
+        moved, gradient = (before[name] - after[name]).flatten(1), gradients[name].flatten(1)
+        far = torch.linalg.svdvals(moved) / (0.2 * RATE * max(moved.shape) ** 0.5)
+        assert far.min() > 0.6
+        assert far.max() < 1.3
+        own = torch.linalg.svdvals(gradient)
+        assert own.max() > 5 * own.min()
 
 
 def test_a_convolution_moves_as_the_matrix_that_it_is(module):
     """PyTorch's Muon of that matrix, in the order of columns that flattening gives, is the reference."""
     before, gradients, after = before_and_after(module, Optimizer(module, RATE, DECAY))
-    for name in ("0.weight", "2.weight", "4.weight"):
+    for name in MATRICES:
         reference = nn.Parameter(before[name].flatten(1).clone())
         reference.grad = gradients[name].flatten(1).clone()
         torch.optim.Muon([reference], RATE, weight_decay=DECAY, adjust_lr_fn="match_rms_adamw").step()
