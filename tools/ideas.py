@@ -285,7 +285,7 @@ def tried(idea: Idea, args: argparse.Namespace) -> dict[str, Any]:
     }
 
 
-def fit(learner: Learner, examples: Examples, idea: Idea, seconds: float) -> int:
+def fit(learner: Learner[Inverter], examples: Examples, idea: Idea, seconds: float) -> int:
     """Train for as long as is given. -> crops seen"""
     started, told = time.process_time(), 0
     with Progress("training", round(seconds)) as progress:

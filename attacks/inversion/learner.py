@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Generic, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -14,17 +15,18 @@ from attacks.inversion.optimizer import Optimizer
 from attacks.inversion.plan import Training
 from bench.device import pick_device, pick_dtype
 
+Module = TypeVar("Module", bound=nn.Module)
 Loss = Callable[[Tensor, Tensor], Tensor]  # (B, 3, H, W) painted, (B, 3, H, W) photographs -> ()
 
 
-class Learner:
+class Learner(Generic[Module]):
     """Takes steps; what it is made of is what a checkpoint holds."""
 
-    def __init__(self, module: nn.Module, training: Training, loss: Loss = reconstruction_loss) -> None:
+    def __init__(self, module: Module, training: Training, loss: Loss = reconstruction_loss) -> None:
         self.training, self.loss = training, loss
         self.device = pick_device()
         self.dtype = pick_dtype(self.device)
-        self.module = module.to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.module: Module = module.to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.optimizer = Optimizer(self.module, training.rate, training.decay)
         self.step = 0
         self.remember()
@@ -54,7 +56,7 @@ class Learner:
                 self.average[name].lerp_(weight, 1 - keep)
         return loss.detach()
 
-    def averaged(self) -> nn.Module:
+    def averaged(self) -> Module:
         """The network with averaged weights, ready to paint."""
         self.module.load_state_dict(self.average)
         return self.module.eval()

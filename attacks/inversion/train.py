@@ -179,10 +179,8 @@ def _checkpoint_path(out: Path) -> Path:
     return out.with_name(out.name + ".checkpoint")
 
 
-class _Trainer(Learner):
+class _Trainer(Learner[Inverter]):
     """A learner with its share of the batches, and the checkpoint that it is resumed from."""
-
-    module: Inverter
 
     def __init__(self, team: Team, shape: Shape, training: Training, out: Path, meta: dict[str, Any], log: Log) -> None:
         torch.manual_seed(training.seed)
@@ -197,7 +195,7 @@ class _Trainer(Learner):
         weights.start_from(self.module, trained, candidates)
         self.remember()
 
-    def run(self, examples: Examples) -> nn.Module:
+    def run(self, examples: Examples) -> Inverter:
         """Train to the end and return the network with averaged weights."""
         if self.step == self.training.steps:
             return self.averaged()
