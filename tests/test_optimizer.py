@@ -17,7 +17,7 @@ def module():
     return layers.to(memory_format=torch.channels_last)
 
 
-def forget_and_learn(module, optimizer, seed):
+def learn(module, optimizer, seed):
     images = torch.randn(7, 4, 5, 5, generator=torch.Generator().manual_seed(seed))
     optimizer.zero_grad()
     (module(images) ** 2).sum().backward()
@@ -27,7 +27,7 @@ def forget_and_learn(module, optimizer, seed):
 def before_and_after(module, optimizer):
     """Weights before a step, gradients, weights after it."""
     before = {name: weight.detach().clone() for name, weight in module.named_parameters()}
-    forget_and_learn(module, optimizer, 0)
+    learn(module, optimizer, 0)
     named = dict(module.named_parameters())
     return before, {name: weight.grad.clone() for name, weight in named.items()}, {name: w.detach() for name, w in named.items()}
 
@@ -69,17 +69,17 @@ def test_what_goes_on_from_a_state_is_the_same(module, restored):
     """Without the state it is not (control)."""
     optimizer = Optimizer(module, RATE, DECAY)
     for seed in range(3):
-        forget_and_learn(module, optimizer, seed)
+        learn(module, optimizer, seed)
     weights = {name: value.clone() for name, value in module.state_dict().items()}
     state = {name: value.clone() for name, value in optimizer.state().items()}
-    forget_and_learn(module, optimizer, 3)
+    learn(module, optimizer, 3)
     expected = {name: value.clone() for name, value in module.state_dict().items()}
 
     module.load_state_dict(weights)
     again = Optimizer(module, RATE, DECAY)
     if restored:
         again.restore(state)
-    forget_and_learn(module, again, 3)
+    learn(module, again, 3)
     same = [
         torch.equal(value, expected[name]) for name, value in module.state_dict().items() if name.endswith(("weight", "bias"))
     ]
@@ -100,5 +100,5 @@ def test_a_weight_without_gradient_stays(module):
     optimizer = Optimizer(module, RATE, DECAY)
     module[0].requires_grad_(False)
     before, after = module[0].weight.clone(), module[0].weight
-    forget_and_learn(module, optimizer, 0)
+    learn(module, optimizer, 0)
     assert torch.equal(before, after)
