@@ -10,7 +10,6 @@ from attacks.dia import DIA
 from attacks.inversion import weights
 from attacks.inversion.painting import painted
 from attacks.inversion.train import check_quantisation, scored
-from attacks.keypoints import Keypoints
 from bench.datasets import photographs
 from bench.features.sift import Sift
 from bench.public import ASSETS, Public
@@ -68,12 +67,11 @@ def test_every_release_that_must_be_served_is_served(public):
 
 
 def test_oriented_descriptors_have_an_attacker_of_their_own(public):
-    """The network for upright ones paints them worse, and is not used (control); positions alone tell less."""
-    oriented, undefended = Sift(upright=False), [Undefended()]
+    """The network for upright ones paints them far worse, and is not used (control)."""
+    oriented = Sift(upright=False)
     assert "no adapted attacker" in (DIA().inapplicable(LDP(), oriented, public) or "")
     images = [source.path for source in photographs.builtin()[:3]]
-    records = bench.run(undefended, [DIA(), Keypoints()], images, extractor=oriented)
-    shown = pd.json_normalize(records).groupby("attack.name")["metrics.ssim"].mean()
+    shown = [record["metrics"]["ssim"] for record in bench.run([Undefended()], [DIA()], images, extractor=oriented)]
     upright = weights.load(ASSETS / "inversion-none.safetensors")
     misled = []
     for path in images:
@@ -81,8 +79,7 @@ def test_oriented_descriptors_have_an_attacker_of_their_own(public):
         release = Undefended().protect(oriented.extract(pixels), public, np.random.default_rng(0))
         image = painted(upright.module, release, None, np.empty(0, np.float32), 1, "invariant")
         misled.append(scored(*(torch.from_numpy(one).permute(2, 0, 1) for one in (image, pixels / np.float32(255))))[1])
-    assert shown["dia"] > shown["keypoints"] > 0
-    assert shown["dia"] > np.mean(misled)
+    assert np.mean(shown) > np.mean(misled) + 0.1
 
 
 def test_the_main_job_repeats_bit_for_bit():
