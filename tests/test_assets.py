@@ -3,19 +3,19 @@
 import numpy as np
 import pandas as pd
 import pytest
-import torch
 
 import bench
 from attacks.dia import DIA
 from attacks.inversion import weights
 from attacks.inversion.painting import painted
-from attacks.inversion.train import check_quantisation, scored
+from attacks.inversion.train import check_quantisation
 from bench.datasets import photographs
 from bench.features.sift import Sift
 from bench.public import ASSETS, Public
 from defenses.affine import Affine
 from defenses.ldp import LDP
 from defenses.none import Undefended
+from metrics.ssim import SSIM
 
 ORIENTED = ASSETS / "inversion-oriented.safetensors"  # of other features, which no defense here is compared on
 NETWORKS = sorted(set(ASSETS.glob("inversion-*.safetensors")) - {ORIENTED})
@@ -78,7 +78,7 @@ def test_oriented_descriptors_have_an_attacker_of_their_own(public):
         pixels = photographs.read(path).pixels
         release = Undefended().protect(oriented.extract(pixels), public, np.random.default_rng(0))
         image = painted(upright.module, release, None, np.empty(0, np.float32), 1, "invariant")
-        misled.append(scored(*(torch.from_numpy(one).permute(2, 0, 1) for one in (image, pixels / np.float32(255))))[1])
+        misled.append(SSIM()(pixels / np.float32(255), image))
     assert np.mean(shown) > np.mean(misled) + 0.1
 
 

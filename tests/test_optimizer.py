@@ -19,7 +19,7 @@ def module():
 
 def learn(module, optimizer, seed):
     images = torch.randn(7, 4, 5, 5, generator=torch.Generator().manual_seed(seed))
-    optimizer.zero_grad()
+    module.zero_grad()
     (module(images) ** 2).sum().backward()
     optimizer.step()
 

@@ -330,8 +330,9 @@ def page(records: Sequence[dict[str, Any]]) -> str:
         "Written by `tools/ideas.py`, which says what each idea is. Raw descriptors; every training from random weights, in "
         "equal processor time; scores on the 100 photographs of `tune.txt` (SSIM where its window fits). Short trainings favour "
         "what learns fast, and each was done once: read small differences as none. *Twice*: painted of the release and "
-        "of that of the mirrored photograph, and averaged. *Earlier*: another layout or optimizer, which the history of "
-        "`tools/ideas.py` has. What was trained longest is the start of all shipped networks, by `bench train` on two cores.",
+        "of that of the mirrored photograph, and averaged. *Earlier*: another layout or optimizer, which the history of this "
+        "repository has, but for Muon without two layers, of which the name says all. Trainings of more than 10 minutes are "
+        "`bench train`'s, and their minutes its threads' by the clock; the longest are the starts of shipped networks.",
     ]
     groups = sorted({(not record["upright"], record["seconds"]) for record in records})
     for oriented, seconds in groups:

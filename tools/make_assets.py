@@ -30,30 +30,20 @@ def main() -> None:
     args = parser.parse_args()
     folders = part(args.data, args.work / "photographs")
     for file, photographs, words in (("dictionary", "01", WORDS), ("public-database", "2", PUBLIC_WORDS)):
-        made = args.work / f"{file}.safetensors"
-        if not made.is_file():
-            run("dictionary", "build", "--images", folders[photographs], "--size", words, "--out", made)
-        shutil.copyfile(made, ASSETS / made.name)
+        build = "dictionary", "build", "--images", folders[photographs], "--size", words
+        ship(made(args.work / f"{file}.safetensors", *build))
     unseen = ["--validation", folders["tune"]]
     given = ["--images", folders["012"], *unseen]
-    start = args.work / "start.safetensors"
-    if not start.is_file():
-        run("train", "--defense", "none", *given, "--steps", args.steps, "--out", start)
+    start = made(args.work / "start.safetensors", "train", "--defense", "none", *given, "--steps", args.steps)
     for name in DEFENSES:
-        network = args.work / f"inversion-{name}.safetensors"
-        if not network.is_file():
-            own = ["--images", folders["2"], *unseen, "--start", start, "--steps", args.own_steps, "--rate", 2e-3]
-            run("train", "--defense", name, *own, "--out", network)
-        shutil.copyfile(network, ASSETS / network.name)
+        own = ["--images", folders["2"], *unseen, "--start", start, "--steps", args.own_steps, "--rate", 2e-3]
+        ship(made(args.work / f"inversion-{name}.safetensors", "train", "--defense", name, *own))
     alone = {
         "positions": ["--encoding", "positions", "--widths", NARROW, "--steps", args.own_steps],
         "inversion-oriented": ["--extractor", "sift:upright=false", "--steps", args.oriented_steps],
     }
     for name, options in alone.items():
-        network = args.work / f"{name}.safetensors"
-        if not network.is_file():
-            run("train", "--defense", "none", *given, *options, "--out", network)
-        shutil.copyfile(network, ASSETS / network.name)
+        ship(made(args.work / f"{name}.safetensors", "train", "--defense", "none", *given, *options))
 
 
 def part(data: Path, work: Path) -> dict[str, Path]:
@@ -72,11 +62,22 @@ def part(data: Path, work: Path) -> dict[str, Path]:
     return folders
 
 
+def made(out: Path, *words: object) -> Path:
+    """What a command of `bench` writes to `out`, unless it is there."""
+    if not out.is_file():
+        run(*words, "--out", out)
+    return out
+
+
 def run(*words: object) -> None:
     command = [str(word) for word in words]
     print("bench", *command, flush=True)
     if bench(command) != 0:
         raise SystemExit(1)
+
+
+def ship(file: Path) -> None:
+    shutil.copyfile(file, ASSETS / file.name)
 
 
 if __name__ == "__main__":

@@ -45,7 +45,7 @@ class Learner(Generic[Module]):
         with torch.autocast(self.device.type, self.dtype, enabled=self.dtype != torch.float32):
             painted = (shared or self.module)(points.to(self.device))
         loss = self.loss(painted, photographs.to(self.device))
-        self.optimizer.zero_grad()
+        self.module.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self.module.parameters(), 1.0)
         self.optimizer.step()

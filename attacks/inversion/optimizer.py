@@ -33,11 +33,6 @@ class Optimizer:
         for group in self.muon.param_groups + self.adamw.param_groups:
             group["lr"] = rate
 
-    def zero_grad(self) -> None:
-        """Forget the gradients."""
-        for weight in self.weights.values():
-            weight.grad = None
-
     def step(self) -> None:
         """Move all weights that have a gradient."""
         for name, view in self.matrices.items():
@@ -48,8 +43,12 @@ class Optimizer:
 
     def state(self) -> dict[str, Tensor]:
         """What `restore` takes: the moments of each weight, by its name."""
-        kept = {name: optimizer.state[weight] for weights, optimizer in self.parts for name, weight in weights.items()}
-        return {f"{name}/{key}": value for name, moments in kept.items() for key, value in moments.items()}
+        return {
+            f"{name}/{key}": value
+            for weights, optimizer in self.parts
+            for name, weight in weights.items()
+            for key, value in optimizer.state[weight].items()
+        }
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
         """Go on from what `state` gave."""
