@@ -28,8 +28,8 @@ class Shape:
     inputs: int  # numbers a keypoint
     candidates: int = 0  # how many of them are embedded one by one and added up; 0: all numbers are embedded together
     length: int = 0  # of one of these candidates
-    hidden: int = 320  # width of the embedding MLP
-    widths: tuple[int, ...] = (64, 128, 224, 224)  # channels at 1/4, 1/8, ... of the image's side
+    hidden: int = 256  # width of the embedding MLP
+    widths: tuple[int, ...] = (32, 64, 112, 112)  # channels at 1/4, 1/8, ... of the image's side
     last: int = 32  # channels at 1/2
     patch: int = 6  # cells: the side of what a keypoint paints around itself
     painted: int = 16  # channels of that
