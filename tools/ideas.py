@@ -413,6 +413,8 @@ def extrapolation(trained: Sequence[dict[str, Any]]) -> list[str]:
     ]
     lines += [markdown_row(("crops", "SSIM", "PSNR")), markdown_row(["---"] * 3)]
     ordered = sorted(trained, key=lambda one: one["crops"])
+    if len(ordered) < 2:
+        return []
     lines += [markdown_row((f"{one['crops']:,}", f"{one['ssim']:.4f}", f"{one['psnr']:.2f}")) for one in ordered]
     logs = np.log2([one["crops"] for one in ordered])
     told = []

@@ -17,16 +17,15 @@ from bench.public import ASSETS
 
 WORDS, PUBLIC_WORDS = 256_000, 128_000
 DEFENSES = ("none", "affine", "ldp")
-NARROW = "48,96,160,160"  # channels of the network for positions, so that all files together stay small
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--work", type=Path, required=True, help="kept between runs; what is done is not done again")
-    parser.add_argument("--steps", type=int, default=5000, help="of the common start, each of 8 crops")
-    parser.add_argument("--own-steps", type=int, default=800, help="of each network from there, and of that for positions")
-    parser.add_argument("--oriented-steps", type=int, default=2500, help="of the network for oriented descriptors")
+    parser.add_argument("--steps", type=int, default=9200, help="of the common start, each of 8 crops")
+    parser.add_argument("--own-steps", type=int, default=1200, help="of each network from there, and of that for positions")
+    parser.add_argument("--oriented-steps", type=int, default=6800, help="of the network for oriented descriptors")
     args = parser.parse_args()
     folders = part(args.data, args.work / "photographs")
     for file, photographs, words in (("dictionary", "01", WORDS), ("public-database", "2", PUBLIC_WORDS)):
@@ -39,7 +38,7 @@ def main() -> None:
         own = ["--images", folders["2"], *unseen, "--start", start, "--steps", args.own_steps, "--rate", 2e-3]
         ship(made(args.work / f"inversion-{name}.safetensors", "train", "--defense", name, *own))
     alone = {
-        "positions": ["--encoding", "positions", "--widths", NARROW, "--steps", args.own_steps],
+        "positions": ["--encoding", "positions", "--steps", args.own_steps],
         "inversion-oriented": ["--extractor", "sift:upright=false", "--steps", args.oriented_steps],
     }
     for name, options in alone.items():
