@@ -404,6 +404,9 @@ def equal(record: dict[str, Any]) -> tuple[bool, float, str]:
 
 def extrapolation(trained: Sequence[dict[str, Any]]) -> list[str]:
     """How the scores of one network grow with the crops that it saw, and how many the paper's would take if that went on."""
+    ordered = sorted(trained, key=lambda one: one["crops"])
+    if len(ordered) < 2:
+        return []
     lines = [
         "",
         "## How the gap closes",
@@ -412,9 +415,6 @@ def extrapolation(trained: Sequence[dict[str, Any]]) -> list[str]:
         "",
     ]
     lines += [markdown_row(("crops", "SSIM", "PSNR")), markdown_row(["---"] * 3)]
-    ordered = sorted(trained, key=lambda one: one["crops"])
-    if len(ordered) < 2:
-        return []
     lines += [markdown_row((f"{one['crops']:,}", f"{one['ssim']:.4f}", f"{one['psnr']:.2f}")) for one in ordered]
     logs = np.log2([one["crops"] for one in ordered])
     told = []
