@@ -24,7 +24,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--work", type=Path, required=True, help="kept between runs; what is done is not done again")
     parser.add_argument("--steps", type=int, default=9200, help="of the common start, each of 8 crops")
-    parser.add_argument("--own-steps", type=int, default=1200, help="of each network from there, and of that for positions")
+    parser.add_argument("--own-steps", type=int, default=1000, help="of each network from there, and of that for positions")
     parser.add_argument("--oriented-steps", type=int, default=6800, help="of the network for oriented descriptors")
     args = parser.parse_args()
     folders = part(args.data, args.work / "photographs")
