@@ -314,7 +314,7 @@ def tried(idea: Idea, args: argparse.Namespace) -> dict[str, Any]:
     network, training = idea.network(), {"warmup": WARMUP, **idea.training}
     if args.start:
         network.load_state_dict(weights.load(args.start).module.state_dict())
-        training = {"rate": 2e-3, **training}  # as tools/make_assets.py goes on from its start
+        training = {"rate": 1e-3, **training}  # as tools/make_assets.py goes on from its start
     learner = Learner(network, Training(**training), idea.measured)
     crops = fit(learner, examples, idea, args.seconds)
     network = learner.averaged()

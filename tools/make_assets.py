@@ -35,7 +35,7 @@ def main() -> None:
     given = ["--images", folders["012"], *unseen]
     start = made(args.work / "start.safetensors", "train", "--defense", "none", *given, "--steps", args.steps)
     for name in DEFENSES:
-        own = ["--images", folders["2"], *unseen, "--start", start, "--steps", args.own_steps, "--rate", 2e-3]
+        own = ["--images", folders["2"], *unseen, "--start", start, "--steps", args.own_steps, "--rate", 1e-3]
         ship(made(args.work / f"inversion-{name}.safetensors", "train", "--defense", name, *own))
     alone = {
         "positions": ["--encoding", "positions", "--steps", args.own_steps],
