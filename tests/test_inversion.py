@@ -355,10 +355,12 @@ def test_a_photograph_is_never_quantised_by_its_own_dictionary(sources, words, t
 def test_quantisation_once_is_quantisation_each_time(sources, words):
     views = collect(sources[3:4], Sift())
     chosen = {view.photograph: words for view in views}
-    table, plain = data.quantise(views, chosen, [0], Public()), Public()
+    sizes, plain = [0, 2000, 500], Public()
+    table = data.quantise(views, chosen, sizes, Public())
     for view in views:
-        expected = plain.nearest_words(words, view.features)
-        assert np.array_equal(table(plain.dictionary(words), view.features.codes), expected)
+        for size in sizes:
+            expected = plain.nearest_words(words, view.features, size)
+            assert np.array_equal(table(plain.dictionary(words, size), view.features.codes), expected)
     with pytest.raises(KeyError):
         table(plain.dictionary(words), np.full((1, 128), 7, np.uint8))
 

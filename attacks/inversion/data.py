@@ -130,17 +130,24 @@ class Quantisation:
 def quantise(
     views: Sequence[PhotographView], dictionaries: Mapping[str, Asset], sizes: Sequence[int], public: Public
 ) -> Quantisation:
-    """Find the nearest words of all views' descriptors, each in its own photograph's dictionary at each of `sizes` (0: whole)."""
+    """Find the nearest words of all views' descriptors, each in its own photograph's dictionary at each of `sizes`.
+
+    Sizes descend, all words (0) first: a word that is nearest among more words is nearest among fewer, if it is one of them.
+    """
     tables = {}
     total = len(sizes) * sum(len(view.features) for view in views)
     with Progress("quantising", total) as progress:
         for asset in sorted(set(dictionaries.values())):
             rows = np.concatenate([queries(view.features) for view in views if dictionaries[view.photograph] == asset])
             keys, first = _first_of_each(row_keys(rows))
+            words = np.full(len(first), np.iinfo(np.int64).max)  # none is known yet
             for size in sizes:
                 known = public.dictionary(asset, size)
-                tables[known.digest] = (keys, known.index.nearest(rows[first], progress.advance))
-                progress.advance(len(rows) - len(first))
+                lost = words >= len(known)
+                words = words.copy()
+                words[lost] = known.index.nearest(rows[first[lost]], progress.advance)
+                tables[known.digest] = (keys, words)
+                progress.advance(len(rows) - np.count_nonzero(lost))
     return Quantisation(tables)
 
 
