@@ -147,7 +147,7 @@ def quantise(
                 words = words.copy()
                 words[lost] = known.index.nearest(rows[first[lost]], progress.advance)
                 tables[known.digest] = (keys, words)
-                progress.advance(len(rows) - np.count_nonzero(lost))
+                progress.advance(len(rows) - int(lost.sum()))
     return Quantisation(tables)
 
 
