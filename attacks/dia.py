@@ -3,7 +3,7 @@
 A network paints the photograph from the release. What is released for a keypoint is stacked: the descriptor itself (the upper
 bound, "Raw"), the m words, or the parameters of a subspace (not its random origin and basis, which are noise: `encoding.py`). The
 network must have been trained for that very distribution of releases; another defense's would make a defense look safe. It paints
-twice, of the release and of what the mirrored photograph would have released, where the extractor tells that; the mean is shown.
+eight times, of what the photograph mirrored and turned would have released, where the extractor tells that; the mean is shown.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from attacks.inversion.encoding import condition
-from attacks.inversion.mirror import mirrored
 from attacks.inversion.painting import painted
+from attacks.inversion.symmetry import symmetries
 from attacks.inversion.weights import Network, load, misfit
 from bench.errors import UserError
 from bench.plugin import Asset, Defense, Extractor, ImageAttack, View
@@ -42,9 +42,8 @@ class DIA(ImageAttack):
     def reconstruct(self, view: View, rng: np.random.Generator) -> Floats:
         network = self._network(view.defense, view.extractor, view.know(Knowledge.TRAINING_IMAGES))
         known = condition(view.defense, network.served)
-        order = view.extractor.mirror_order()
-        mirror = None if order is None else mirrored(view.release, order)
-        return painted(network.module, view.release, mirror, known, network.meta["slots"], network.meta["encoding"])
+        seen = symmetries(view.extractor)
+        return painted(network.module, view.release, seen, known, network.meta["slots"], network.meta["encoding"])
 
     def _network(self, defense: Defense, extractor: Extractor, public: Public) -> Network:
         path, reason = _choose(self.weights, defense, extractor, public)

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from attacks.inversion.mirror import elsewhere
 from attacks.inversion.painting import painted
+from attacks.inversion.symmetry import OF_POSITIONS
 from attacks.inversion.weights import Network, load, other_features
 from bench.errors import UserError
 from bench.plugin import Asset, Defense, Extractor, ImageAttack, View
@@ -39,8 +39,7 @@ class Keypoints(ImageAttack):
         return {"weights": self._network().digest}
 
     def reconstruct(self, view: View, rng: np.random.Generator) -> Floats:
-        known = np.empty(0, np.float32)
-        return painted(self._network().module, view.release, elsewhere(view.release), known, 0, "positions")
+        return painted(self._network().module, view.release, OF_POSITIONS, np.empty(0, np.float32), 0, "positions")
 
     def _network(self) -> Network:
         if self.weights != "shipped":

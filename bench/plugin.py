@@ -318,6 +318,10 @@ class Extractor(Plugin, ABC):
         """The order in which a descriptor's components are those of the mirrored photograph's, (D,); None if there is none."""
         return None
 
+    def turn_order(self) -> Indices | None:
+        """The same for the photograph turned by a quarter, counter-clockwise."""
+        return None
+
     def unlimited(self) -> Extractor:
         """The same without its limit on the number of keypoints, if it has one: for dictionaries, which are made of many."""
         return self

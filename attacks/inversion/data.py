@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from attacks.inversion.encoding import condition
+from attacks.inversion.symmetry import IDENTITY, Symmetry
 from bench.datasets.photographs import SIDE
 from bench.errors import UnitError, UserError
 from bench.features.dictionary import Dictionary
@@ -47,9 +48,10 @@ class Examples:
     served: Served
     dictionaries: Mapping[str, Asset]  # photograph -> the dictionary that may quantise it; empty if nothing is quantised
     public: Public
+    symmetries: Sequence[Symmetry] = (IDENTITY,)  # under which they are drawn, each as often
 
     def draw(self, rng: np.random.Generator) -> Example:
-        """A random crop of a random view under random served settings.
+        """A random crop of a random view under random served settings, and a random symmetry.
 
         Raises
         ------
@@ -62,8 +64,10 @@ class Examples:
                 break
         else:
             raise UserError("none of 100 photographs could be used")
-        pixels, secret = random_crop(view, rng)
-        return self._release(view.photograph, pixels, secret, rng)
+        example = self._release(view.photograph, *random_crop(view, rng), rng)
+        symmetry = self.symmetries[int(rng.integers(len(self.symmetries)))]
+        pixels, release = symmetry.of_image(example.pixels), symmetry.of_release(example.release)
+        return dataclasses.replace(example, pixels=pixels, release=release)
 
     def whole(self, view: PhotographView, rng: np.random.Generator) -> Example:
         """A whole view of 256 x 256, under random served settings."""

@@ -1,24 +1,30 @@
-"""What an attacker shows: a photograph painted by a network of a release, twice where it can be."""
+"""What an attacker shows: a photograph painted by a network of a release, under each symmetry that is known."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 
 from attacks.inversion.encoding import Encoding, Points, encode
+from attacks.inversion.symmetry import Symmetry
 from bench.device import pick_dtype
 from bench.types import Floats, Release
 
 
-def painted(module: nn.Module, release: Release, mirror: Release | None, known: Floats, slots: int, encoding: Encoding) -> Floats:
-    """The mean of what the network paints of a release and of that of the mirrored photograph. -> (H, W, 3) in [0, 1]
+def painted(
+    module: nn.Module, release: Release, seen: Sequence[Symmetry], known: Floats, slots: int, encoding: Encoding
+) -> Floats:
+    """The mean of what the network paints of a release under each symmetry, moved back. -> (H, W, 3) in [0, 1]
 
-    A network's mistakes on the two differ, and some cancel. `mirror` is None where it is not known.
+    A network's mistakes on them differ, and some cancel.
     """
-    both = [release] if mirror is None else [release, mirror]
-    images = paint(module, encode(both, [known] * len(both), slots, encoding)).cpu()
-    mean = images[0] if mirror is None else (images[0] + images[1].flip(2)) / 2
-    return mean.permute(1, 2, 0).numpy()
+    images = []
+    for symmetry in seen:
+        moved = encode([symmetry.of_release(release)], [known], slots, encoding)
+        images.append(symmetry.undone(paint(module, moved)[0]))
+    return torch.stack(images).mean(dim=0).permute(1, 2, 0).cpu().numpy()
 
 
 @torch.inference_mode()

@@ -6,6 +6,7 @@ and several processes make one batch.
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 import os
@@ -29,6 +30,7 @@ from attacks.inversion.loss import ssim
 from attacks.inversion.network import Inverter, Shape
 from attacks.inversion.painting import paint
 from attacks.inversion.plan import Plan, Training
+from attacks.inversion.symmetry import OF_POSITIONS, symmetries
 from attacks.inversion.team import Team, launch
 from bench import tensorfile
 from bench.device import pick_device
@@ -76,6 +78,8 @@ def take_part(team: Team, plan: Plan, out: Path, log: Path | None) -> dict[str, 
     views = collect(list(plan.photographs), extractor) if few else OnDemand(plan.photographs, extractor)
     unseen = collect(list(plan.validation), extractor)[::4]  # as they are, at 256 pixels
     examples, held_out, errors = _examples(plan, views, unseen)
+    moved = OF_POSITIONS if encoding == "positions" else symmetries(extractor)
+    examples = dataclasses.replace(examples, symmetries=moved)
     slots, length = _stacked(defense, held_out, unseen[0], encoding)
     sample = encode([(first := held_out.whole(unseen[0], np.random.default_rng(0))).release], [first.condition], slots, encoding)
     one_by_one = slots if encoding == "invariant" and defense.releases is WordSets else 0
@@ -89,6 +93,7 @@ def take_part(team: Team, plan: Plan, out: Path, log: Path | None) -> dict[str, 
         "crops": training.steps * training.batch,
         "batch": training.batch,
         "optimizer": "muon",
+        "symmetries": len(moved),
         "rate": training.rate,
         "seed": training.seed,
         "quantisation_error": errors,

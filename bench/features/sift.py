@@ -70,6 +70,14 @@ class Sift(Extractor):
         order: Indices = ((row * 4 + column) * 8 + angle).ravel()
         return order
 
+    def turn_order(self) -> Indices:
+        """Upright: columns of the histograms become rows from below, and angle a becomes a + π / 2. Oriented: as it was."""
+        row, column, angle = np.indices((4, 4, 8))
+        if self.upright:
+            row, column, angle = column, 3 - row, (angle - 2) % 8
+        order: Indices = ((row * 4 + column) * 8 + angle).ravel()
+        return order
+
     def unlimited(self) -> Extractor:
         return replace(self, max_keypoints=sys.maxsize)
 
