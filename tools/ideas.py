@@ -32,17 +32,17 @@ from attacks.inversion.data import Example, Examples
 from attacks.inversion.encoding import CELL, Points
 from attacks.inversion.learner import Learner
 from attacks.inversion.loss import LUMA, WEIGHT, ssim
-from attacks.inversion.mirror import mirrored
 from attacks.inversion.network import Inverter, Shape
 from attacks.inversion.painting import painted
 from attacks.inversion.plan import Training
+from attacks.inversion.symmetry import IDENTITY, Symmetry, symmetries
 from attacks.inversion.train import scored, to_batch, validate
 from bench.datasets.photographs import folder
 from bench.features.sift import Sift
 from bench.features.views import PhotographView, collect
 from bench.progress import Progress
 from bench.public import Public
-from bench.types import Descriptors, Indices
+from bench.types import Descriptors
 from defenses.none import Undefended
 from leaderboard.tables import markdown_row
 
@@ -52,7 +52,7 @@ SIZES = ("crops", "parameters", "photographs", "date")
 WARMUP = 50  # steps; fewer than `bench train` takes, for these trainings are short
 UNCHANGED = "as bench train"
 PAPER = {"ssim": (0.6878, 3), "psnr": (18.59, 2)}  # its row of raw descriptors, and digits
-FEWER = {UNCHANGED, "200 photographs", "400 photographs"}
+UNTURNED = "not turned"  # but mirrored, as half of the views are
 INPUTS = 128 + 2  # a raw descriptor, and the place within a cell
 
 
@@ -237,6 +237,7 @@ class Idea:
     zoomed: float = 1.0  # least share of a crop's side that is looked at
     relit: float = 0.0  # share of the range by which brightness and contrast change, at most
     upright: bool = True
+    turned: bool = True
 
     def network(self) -> Inverter:
         shape = Shape(**{"inputs": INPUTS} | self.shape)
@@ -280,8 +281,11 @@ IDEAS = {
     "zoomed": Idea(zoomed=0.7),
     "brightness and contrast": Idea(relit=0.1),
     "attention": Idea(attention=2),
-    "200 photographs": Idea(photographs=200),
-    "400 photographs": Idea(photographs=400),
+    f"{UNCHANGED}; 200 photographs": Idea(photographs=200),
+    f"{UNCHANGED}; 400 photographs": Idea(photographs=400),
+    UNTURNED: Idea(turned=False),
+    f"{UNTURNED}; 200 photographs": Idea(turned=False, photographs=200),
+    f"{UNTURNED}; 400 photographs": Idea(turned=False, photographs=400),
     "oriented": Idea(upright=False),
     "oriented: attention": Idea(upright=False, attention=2),
 }
@@ -309,7 +313,10 @@ def main() -> None:
 def tried(idea: Idea, args: argparse.Namespace) -> dict[str, Any]:
     """Train for as long as is given, and score the averaged weights."""
     photographs, tune = (seen(args, which, idea.upright) for which in ("012", "tune"))
-    examples, unseen = (Examples(views, Undefended(), {}, {}, Public()) for views in (photographs[: 4 * idea.photographs], tune))
+    known = symmetries(Sift(upright=idea.upright))
+    under = known if idea.turned else (IDENTITY,)
+    examples = Examples(photographs[: 4 * idea.photographs], Undefended(), {}, {}, Public(), under)
+    unseen = Examples(tune, Undefended(), {}, {}, Public())
     torch.manual_seed(0)
     network, training = idea.network(), {"warmup": WARMUP, **idea.training}
     if args.start:
@@ -319,7 +326,7 @@ def tried(idea: Idea, args: argparse.Namespace) -> dict[str, Any]:
     crops = fit(learner, examples, idea, args.seconds)
     network = learner.averaged()
     scores = validate(network, unseen, tune[::4], 1, "invariant")
-    twice = painted_twice(network, Sift(upright=idea.upright).mirror_order(), tune[::4])
+    averaged = shown(network, known, tune[::4])
     parameters = sum(weight.numel() for weight in network.parameters())
     return {
         "upright": idea.upright,
@@ -329,7 +336,7 @@ def tried(idea: Idea, args: argparse.Namespace) -> dict[str, Any]:
         "crops": crops,
         "parameters": parameters,
         **{metric: scores[metric] for metric in ("mae", "ssim", "psnr")},
-        "twice": twice,
+        "shown": averaged,
     }
 
 
@@ -347,16 +354,16 @@ def fit(learner: Learner[Inverter], examples: Examples, idea: Idea, seconds: flo
     return learner.step * learner.training.batch
 
 
-def painted_twice(network: nn.Module, order: Indices, views: Sequence[PhotographView]) -> dict[str, float]:
-    """Mean SSIM and PSNR of the average of what is painted of a release and of that of the mirrored photograph."""
+def shown(network: nn.Module, known: Sequence[Symmetry], views: Sequence[PhotographView]) -> dict[str, float]:
+    """Mean SSIM and PSNR of the average of what is painted under all symmetries, as `dia` shows it."""
     scores = []
     for view in views:
         raw = view.features
         release = Descriptors(keypoints=raw.keypoints, size=raw.size, descriptors=raw.descriptors)
-        image = painted(network, release, mirrored(release, order), np.empty(0, np.float32), 1, "invariant")
+        image = painted(network, release, known, np.empty(0, np.float32), 1, "invariant")
         scores.append(scored(*(torch.from_numpy(pixels).permute(2, 0, 1) for pixels in (image, view.pixels / np.float32(255)))))
     _, similarity, psnr = np.mean(scores, axis=0)
-    return {"ssim": float(similarity), "psnr": float(psnr)}
+    return {"times": len(known), "ssim": float(similarity), "psnr": float(psnr)}
 
 
 def seen(args: argparse.Namespace, which: str, upright: bool) -> list[PhotographView]:
@@ -377,31 +384,36 @@ def page(records: Sequence[dict[str, Any]]) -> str:
         "",
         "Written by `tools/ideas.py`, which says what each idea is. Raw descriptors; trainings in equal processor time, from "
         "random weights but where a start is named; scores on the 100 photographs of `tune.txt` (SSIM where its window fits). "
-        "Short trainings favour what learns fast, and each was done once: read small differences as none. *Twice*: painted of "
-        "the release and of that of the mirrored photograph, and averaged. *Earlier*: another layout or optimizer, which the "
-        "history of this repository has, but for Muon without two layers, of which the name says all. Trainings of more than 10 "
-        "minutes are `bench train`'s, and their minutes its threads' by the clock; the longest are starts of shipped networks.",
+        "Short trainings favour what learns fast, and each was done once: read small differences as none. *Shown*: painted of "
+        "what the photograph mirrored, or turned, too, would have released, so many times, and averaged. *Earlier*: another "
+        "layout or optimizer, which the history of this repository has, but for Muon without two layers, of which the name says "
+        "all. Trainings of more than 10 minutes are `bench train`'s, and their minutes its threads' by the clock; the longest "
+        "are starts of shipped networks.",
     ]
     for group in sorted({equal(record) for record in records}):
         oriented, seconds, start = group
         here = [record for record in records if equal(record) == group]
         kind, origin = "Oriented" if oriented else "Upright", f", from `{start}`" if start else ""
         lines += ["", f"## {kind} SIFT, {seconds / 60:g} minutes of one core{origin}", ""]
-        lines += [markdown_row(("idea", "MAE", "SSIM, PSNR", "twice", *SIZES))]
+        lines += [markdown_row(("idea", "MAE", "SSIM, PSNR", "shown", *SIZES))]
         lines += [markdown_row(["---"] * 8)]
         for record in sorted(here, key=lambda record: -record["ssim"]):
-            once, twice = record, record["twice"]
-            scores = [f"{once['mae']:.4f}", *(f"{one['ssim']:.4f}, {one['psnr']:.2f}" for one in (once, twice))]
+            averaged = record["shown"]
+            scores = [f"{record['mae']:.4f}", f"{record['ssim']:.4f}, {record['psnr']:.2f}"]
+            scores += [f"{averaged['ssim']:.4f}, {averaged['psnr']:.2f} ({averaged['times']})"]
             sizes = f"{record['crops']:,}", f"{record['parameters'] / 1e6:.1f} M"
             lines.append(markdown_row((record["idea"], *scores, *sizes, record["trained_on"], record["date"])))
-    alike = [record for record in records if record["idea"] in FEWER and record["upright"] and not record.get("start")]
-    whole = [record for record in alike if record["idea"] == UNCHANGED]
-    longest = max((record["seconds"] for record in alike if record["trained_on"] < 800), default=0)
-    same = [record for record in alike if record["seconds"] == longest]
-    lines += ["", "## How the gap closes", "", "From random weights, upright, painted once. The more crops:"]
-    lines += extrapolation(whole, "crops")
-    lines += ["", f"The more photographs, in {longest / 60:g} minutes of one core:"]
-    lines += extrapolation(same, "trained_on")
+    alone = [record for record in records if record["upright"] and not record.get("start")]
+    lines += ["", "## How the gap closes", "", "From random weights, upright, painted once."]
+    for idea in (UNCHANGED, UNTURNED):
+        whole = [record for record in alone if record["idea"] == idea]
+        fewer = [record for record in alone if record["idea"] in (f"{idea}; 200 photographs", f"{idea}; 400 photographs")]
+        longest = max((record["seconds"] for record in fewer), default=0)
+        same = [record for record in whole if record["seconds"] == longest]
+        lines += extrapolation(f"{idea.capitalize()}, the more crops", whole, "crops")
+        lines += extrapolation(
+            f"{idea.capitalize()}, the more photographs, in {longest / 60:g} minutes", fewer + same, "trained_on"
+        )
     return "\n".join(lines) + "\n"
 
 
@@ -410,13 +422,13 @@ def equal(record: dict[str, Any]) -> tuple[bool, float, str]:
     return not record["upright"], record["seconds"], record.get("start") or ""
 
 
-def extrapolation(trained: Sequence[dict[str, Any]], by: str) -> list[str]:
+def extrapolation(told: str, trained: Sequence[dict[str, Any]], by: str) -> list[str]:
     """How scores grow with what is kept under `by`, and how much of it the paper's would take if that went on."""
     ordered, name = sorted(trained, key=lambda one: one[by]), "photographs" if by == "trained_on" else by
+    if len(ordered) < 2:
+        return []
     table = [markdown_row((name, "SSIM", "PSNR")), markdown_row(["---"] * 3)]
     table += [markdown_row((f"{one[by]:,}", f"{one['ssim']:.4f}", f"{one['psnr']:.2f}")) for one in ordered]
-    if len(ordered) < 2:
-        return ["", *table]
     logs = np.log2([one[by] for one in ordered])
     said = []
     for metric, (paper, digits) in PAPER.items():
@@ -424,7 +436,7 @@ def extrapolation(trained: Sequence[dict[str, Any]], by: str) -> list[str]:
         grown = f"{metric.upper()} grows by {slope:.{digits}f} for each doubling"
         said.append(f"{grown}, and would be the paper's {paper} after {2 ** ((paper - offset) / slope):.1e} {name}")
     line = f"By a line through these {len(ordered)}, {'; '.join(said)}. That is an extrapolation, and no measurement."
-    return ["", *table, "", line]
+    return ["", f"{told}:", "", *table, "", line]
 
 
 if __name__ == "__main__":
