@@ -147,7 +147,7 @@ def query(service: Service, rates: Rates) -> Iterator[Cost]:
         who="server", step="match, affine", operations=(dim + 1) * matching, seconds=(dim + 1) * matching / rates.subspaces
     )
     yield Cost(who="attacker", step="affine: words near subspaces", operations=attack, seconds=attack / rates.subspaces)
-    yield Cost(who="attacker", step="paint, 256 x 256, twice", seconds=rates.painting)
+    yield Cost(who="attacker", step="paint, 256 x 256, eight times", seconds=rates.painting)
 
 
 def rows(service: Service, rates: Rates, queries: int) -> list[tuple[str, ...]]:
