@@ -8,6 +8,7 @@ import bench
 from attacks.dia import DIA
 from attacks.inversion import weights
 from attacks.inversion.painting import painted
+from attacks.inversion.symmetry import symmetries
 from attacks.inversion.train import check_quantisation
 from bench.datasets import photographs
 from bench.features.sift import Sift
@@ -77,7 +78,7 @@ def test_oriented_descriptors_have_an_attacker_of_their_own(public):
     for path in images:
         pixels = photographs.read(path).pixels
         release = Undefended().protect(oriented.extract(pixels), public, np.random.default_rng(0))
-        image = painted(upright.module, release, None, np.empty(0, np.float32), 1, "invariant")
+        image = painted(upright.module, release, symmetries(oriented), np.empty(0, np.float32), 1, "invariant")
         misled.append(SSIM()(pixels / np.float32(255), image))
     assert np.mean(shown) > np.mean(misled) + 0.1
 

@@ -166,23 +166,23 @@ def scattered(net, values, places, size=(64, 48)):
 @pytest.mark.parametrize("patch", [5, 6])
 def test_keypoints_that_share_a_cell_are_added_up(patch, rng):
     """The rule of `network.py`, whatever the order of the keypoints; patches reach as far on all sides, and not outside."""
-    net = Inverter(Shape(inputs=130, patch=patch, painted=2)).eval()
+    net, counts = Inverter(Shape(inputs=130, widths=(9, 9), patch=patch, painted=2)).eval(), 8  # the channel that counts
     values = torch.from_numpy(rng.normal(size=(3, 130)).astype(np.float32))
     places = torch.tensor([[7.3, 1.8], [7.6, 1.2], [0.2, 15.7]])
     grid = scattered(net, values, places)
-    expected = torch.zeros(16, 12, 66)
+    expected = torch.zeros(16, 12, counts + 3)
     with torch.inference_mode():
         hidden = net.embed(values)
         own, around = net.own(hidden), net.around(hidden).view(3, patch, patch, 2)
     for keypoint, (x, y) in enumerate(places.tolist()):
-        expected[int(y), int(x), :63] += own[keypoint]
-        expected[int(y), int(x), 63] += 1
+        expected[int(y), int(x), :counts] += own[keypoint]
+        expected[int(y), int(x), counts] += 1
         for row in range(patch):
             for column in range(patch):
                 # The patch's middle is the keypoint, to half a cell.
                 down, right = int(np.floor(y - (patch - 1) / 2)) + row, int(np.floor(x - (patch - 1) / 2)) + column
                 if 0 <= down < 16 and 0 <= right < 12:
-                    expected[down, right, 64:] += around[keypoint, row, column]
+                    expected[down, right, counts + 1 :] += around[keypoint, row, column]
     torch.testing.assert_close(grid, expected.permute(2, 0, 1), atol=1e-5, rtol=1e-5)
     torch.testing.assert_close(scattered(net, values.flip(0), places.flip(0)), grid, atol=1e-5, rtol=1e-5)
     assert not torch.allclose(scattered(net, values.flip(0), places), grid, atol=1e-2)  # control: it matters who lies where
