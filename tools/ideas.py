@@ -387,8 +387,7 @@ def page(records: Sequence[dict[str, Any]]) -> str:
         "Short trainings favour what learns fast, and each was done once: read small differences as none. *Shown*: painted of "
         "what the photograph mirrored, or turned, too, would have released, so many times, and averaged. *Earlier*: another "
         "layout or optimizer, which the history of this repository has, but for Muon without two layers, of which the name says "
-        "all. Trainings of more than 10 minutes are `bench train`'s, and their minutes its threads' by the clock; the longest "
-        "are starts of shipped networks.",
+        "all. Trainings of more than 10 minutes are `bench train`'s, and their minutes its threads' by the clock.",
     ]
     for group in sorted({equal(record) for record in records}):
         oriented, seconds, start = group
