@@ -116,6 +116,25 @@ def fitting_dictionaries(photographs: set[str], candidates: Sequence[Asset], pub
     return chosen
 
 
+def check_lengths(assets: set[Asset], sizes: Sequence[int], public: Public) -> None:
+    """Refuse dictionaries of other sizes than one another: at one epsilon the fewer words tell the true one more often, so a
+    network that is told epsilon would learn to trust words as it must not, or to distrust them.
+
+    Raises
+    ------
+    UserError
+        if at any of `sizes` one dictionary has fewer words than another.
+    """
+    for size in sizes:
+        lengths = {asset: len(public.dictionary(asset, size)) for asset in assets}
+        if len(set(lengths.values())) > 1:
+            told = ", ".join(f"{asset} {length:,}" for asset, length in sorted(lengths.items()))
+            raise UserError(
+                f"--crossfit: photographs would be quantised by dictionaries of other sizes ({told} words), which tell the true "
+                "word more or less often at one epsilon; name dictionaries of as many words, or fix a number that all have"
+            )
+
+
 class Quantisation:
     """The nearest words of all rows of a training set, found once. A `Quantiser` for `Public`."""
 

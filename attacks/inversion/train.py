@@ -22,7 +22,7 @@ import torch
 from torch import Tensor, nn
 
 from attacks.inversion import weights
-from attacks.inversion.data import Example, Examples, Served, fitting_dictionaries, quantisation_error, quantise
+from attacks.inversion.data import Example, Examples, Served, check_lengths, fitting_dictionaries, quantisation_error, quantise
 from attacks.inversion.encoding import Encoding, Points, encode, stack
 from attacks.inversion.learner import Learner
 from attacks.inversion.log import Log
@@ -136,6 +136,7 @@ def _examples(
     chosen = fitting_dictionaries(photographs_of(views), [own, *plan.crossfit], plain)
     chosen_unseen = fitting_dictionaries(photographs_of(unseen), [own], plain)
     sizes = _sizes(defense, served)
+    check_lengths({*chosen.values(), *chosen_unseen.values()}, sizes, plain)
     public = Public(remembered=0) if isinstance(views, OnDemand) else Public(quantise(views, chosen, sizes, plain), remembered=0)
     examples, held_out = Examples(views, defense, served, chosen, public), Examples(unseen, defense, served, chosen_unseen, plain)
     compared = views[:: 4 * math.ceil(len(views) / (4 * COMPARED))]  # as they are, at 256 pixels
