@@ -387,7 +387,8 @@ def page(records: Sequence[dict[str, Any]]) -> str:
         "Short trainings favour what learns fast, and each was done once: read small differences as none. *Shown*: painted of "
         "what the photograph mirrored, or turned, too, would have released, so many times, and averaged. *Earlier*: another "
         "layout or optimizer, which the history of this repository has, but for Muon without two layers, of which the name says "
-        "all. Trainings of more than 10 minutes are `bench train`'s, and their minutes its threads' by the clock.",
+        "all. Trainings of more than 10 minutes are `bench train`'s, and their minutes its threads' by the clock; "
+        "what is shipped was trained in legs, each from where the one before ended.",
     ]
     for group in sorted({equal(record) for record in records}):
         oriented, seconds, start = group
@@ -413,6 +414,10 @@ def page(records: Sequence[dict[str, Any]]) -> str:
         lines += extrapolation(
             f"{idea.capitalize()}, the more photographs, in {longest / 60:g} minutes", fewer + same, "trained_on"
         )
+    first = [record for record in alone if record["idea"] == UNTURNED]
+    later = [record for record in records if record["upright"] and "before" in record]
+    legs = [*first, *(record | {"crops": record["before"] + record["crops"]} for record in later)]
+    lines += extrapolation("Leg by leg, the first not turned, the more crops in all", legs, "crops") if later else []
     return "\n".join(lines) + "\n"
 
 
