@@ -415,6 +415,7 @@ def page(records: Sequence[dict[str, Any]]) -> str:
             f"{idea.capitalize()}, the more photographs, in {longest / 60:g} minutes", fewer + same, "trained_on"
         )
     first = [record for record in alone if record["idea"] == UNTURNED]
+    # `before`: the crops that its start had seen, in rows of `bench train`, which are added by hand.
     later = [record for record in records if record["upright"] and "before" in record]
     legs = [*first, *(record | {"crops": record["before"] + record["crops"]} for record in later)]
     lines += extrapolation("Leg by leg, the first not turned, the more crops in all", legs, "crops") if later else []
