@@ -294,6 +294,17 @@ def test_a_network_started_from_another_reads_a_descriptor_as_it_does(slots, can
     )
 
 
+@pytest.mark.parametrize("shape", [Shape(inputs=3 * 128 + 3), Shape(inputs=4 * 128 + 3, candidates=4, length=128)])
+def test_a_network_started_from_one_for_such_releases_is_that_one(shape):
+    """It goes on where the other ended, with all slots and the condition."""
+    trained, fresh = Inverter(shape), Inverter(shape)
+    weights.start_from(fresh, trained, max(1, shape.candidates))
+    assert all(torch.equal(value, fresh.state_dict()[name]) for name, value in trained.state_dict().items())
+    stranger = Inverter(Shape(inputs=2 * 128 + 3))
+    with pytest.raises(UserError, match="reads other releases"):
+        weights.start_from(stranger, trained, 1)
+
+
 def test_training_learns(sources, tmp_path):
     """Forty steps on two photographs bring the loss well below that of the first."""
     import attacks.inversion.train as module

@@ -81,16 +81,16 @@ def _load(path: Path, version: object) -> Network:
 
 @torch.no_grad()
 def start_from(fresh: Inverter, trained: Inverter, candidates: int) -> None:
-    """Start a network from one that paints raw descriptors.
+    """Start a network from one that read the same kind of release, or from one that paints raw descriptors.
 
-    Its first layer reads the first `candidates` slots as descriptors (a set's words; of a subspace the point nearest to zero),
-    with weights shared out so that the sum of independent ones keeps its size, and nothing of the other slots and the
-    condition. Everything else is taken over as it is.
+    From the latter, its first layer reads the first `candidates` slots as descriptors (a set's words; of a subspace the point
+    nearest to zero), with weights shared out so that the sum of independent ones keeps its size, and nothing of the other slots
+    and the condition. Everything else is taken over as it is.
 
     Raises
     ------
     UserError
-        if the two networks have other sizes.
+        if the two networks have other sizes, or `trained` reads neither such releases nor raw descriptors.
     """
     first = "embed.0.weight"
     old, new = trained.state_dict(), fresh.state_dict()
@@ -98,9 +98,14 @@ def start_from(fresh: Inverter, trained: Inverter, candidates: int) -> None:
         raise UserError("--start: that network has other sizes")
     places = old[first].shape[1] - 2  # columns of the descriptor; two more say where in its cell the keypoint lies
     slots = (new[first].shape[1] - 2) // places
+    alike = new[first].shape == old[first].shape
+    if not alike and (trained.shape.candidates or slots < candidates):
+        raise UserError("--start: that network reads other releases")
     for name, value in new.items():
-        if name != first:
+        if name != first or alike:
             value.copy_(old[name])
+    if alike:
+        return
     new[first].zero_()
     new[first][:, : candidates * places] = (old[first][:, :places] / candidates**0.5).repeat(1, candidates)
     new[first][:, slots * places : slots * places + 2] = old[first][:, places:]

@@ -38,7 +38,9 @@ def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--profile", choices=("cpu", "paper"), default="cpu", help="sizes, where no other option gives them")
     parser.add_argument("--devices", type=whole, default=1, metavar="N", help="GPUs, or CPU processes, that share each batch")
     parser.add_argument("--widths", type=wholes, metavar="N,N,...", help="channels of the network's levels")
-    parser.add_argument("--start", type=Path, metavar="FILE", help="weights of a network for raw descriptors to start from")
+    parser.add_argument(
+        "--start", type=Path, metavar="FILE", help="weights to start from, of a network for such releases or for raw descriptors"
+    )
     parser.add_argument("--rate", type=float, metavar="R", help="the learning rate at its peak")
     parser.add_argument("--steps", type=whole, metavar="N", help="steps of training")
     parser.add_argument("--batch", type=whole, metavar="N", help="photographs a step")
