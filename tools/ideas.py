@@ -39,6 +39,7 @@ from attacks.inversion.plan import Training
 from attacks.inversion.symmetry import IDENTITY, Symmetry, symmetries
 from attacks.inversion.train import scored, to_batch, validate
 from bench.datasets.photographs import folder
+from bench.errors import UserError
 from bench.features.sift import Sift
 from bench.features.views import PhotographView, collect
 from bench.progress import Progress
@@ -298,7 +299,10 @@ def main() -> None:
     parser.add_argument("--start", type=Path, help="a network for raw descriptors to start from, instead of random weights")
     args = parser.parse_args()
     for name in args.idea or [name for name in IDEAS if name != VGG or vgg_file().is_file()]:
-        record = {"idea": name, "date": time.strftime("%Y-%m-%d"), **tried(IDEAS[name], args)}
+        try:
+            record = {"idea": name, "date": time.strftime("%Y-%m-%d"), **tried(IDEAS[name], args)}
+        except UserError as error:
+            parser.error(str(error))
         print(record, flush=True)
         with LOG.open("a", encoding="utf-8") as log:
             log.write(json.dumps(record) + "\n")
