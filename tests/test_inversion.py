@@ -294,13 +294,15 @@ def test_a_network_started_from_another_reads_a_descriptor_as_it_does(slots, can
     )
 
 
-@pytest.mark.parametrize("shape", [Shape(inputs=3 * 128 + 3), Shape(inputs=4 * 128 + 3, candidates=4, length=128)])
+@pytest.mark.parametrize(
+    "shape", [Shape(inputs=2), Shape(inputs=3 * 128 + 3), Shape(inputs=4 * 128 + 3, candidates=4, length=128)], ids=str
+)
 def test_a_network_started_from_one_for_such_releases_is_that_one(shape):
     """It goes on where the other ended, with all slots and the condition."""
     trained, fresh = Inverter(shape), Inverter(shape)
     weights.start_from(fresh, trained, max(1, shape.candidates))
     assert all(torch.equal(value, fresh.state_dict()[name]) for name, value in trained.state_dict().items())
-    stranger = Inverter(Shape(inputs=2 * 128 + 3))
+    stranger = Inverter(Shape(inputs=2 * 128 + 3))  # of fewer slots
     with pytest.raises(UserError, match="reads other releases"):
         weights.start_from(stranger, trained, 1)
 

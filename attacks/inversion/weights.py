@@ -96,16 +96,15 @@ def start_from(fresh: Inverter, trained: Inverter, candidates: int) -> None:
     old, new = trained.state_dict(), fresh.state_dict()
     if any(old[name].shape != value.shape for name, value in new.items() if name != first):
         raise UserError("--start: that network has other sizes")
-    places = old[first].shape[1] - 2  # columns of the descriptor; two more say where in its cell the keypoint lies
-    slots = (new[first].shape[1] - 2) // places
-    alike = new[first].shape == old[first].shape
-    if not alike and (trained.shape.candidates or slots < candidates):
-        raise UserError("--start: that network reads other releases")
     for name, value in new.items():
-        if name != first or alike:
+        if value.shape == old[name].shape:
             value.copy_(old[name])
-    if alike:
+    if new[first].shape == old[first].shape:
         return
+    places = old[first].shape[1] - 2  # columns of the descriptor; two more say where in its cell the keypoint lies
+    slots = (new[first].shape[1] - 2) // max(1, places)
+    if trained.shape.candidates or not places or slots < candidates:
+        raise UserError("--start: that network reads other releases")
     new[first].zero_()
     new[first][:, : candidates * places] = (old[first][:, :places] / candidates**0.5).repeat(1, candidates)
     new[first][:, slots * places : slots * places + 2] = old[first][:, places:]
