@@ -41,7 +41,7 @@ class Plan:
     validation: Sequence[Source]
     extractor: Extractor
     crossfit: Sequence[Asset] = ()  # dictionaries for photographs that helped to make the defense's own
-    start: Path | None = None  # weights of a network for raw descriptors to start from; random ones if None
+    start: Path | None = None  # weights to start from, of a network for such releases or for raw descriptors; random ones if None
     encoding: Encoding = "invariant"  # what the network is told of a keypoint
     widths: tuple[int, ...] = Shape.widths  # of the network's levels
     training: Training = Training()  # frozen

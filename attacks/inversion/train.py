@@ -198,7 +198,7 @@ class _Trainer(Learner[Inverter]):
             self._restore()
 
     def start_from(self, trained: Inverter, candidates: int) -> None:
-        """Take over a network for raw descriptors."""
+        """Take over another network, and let the average begin there."""
         weights.start_from(self.module, trained, candidates)
         self.remember()
 
