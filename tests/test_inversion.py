@@ -476,6 +476,11 @@ def test_from_the_command_line(album, tmp_path, sources, capsys):
     again = tmp_path / "again.safetensors"
     assert main([*command[:-1], str(again), "--steps", "2", "--batch", "2", "--start", str(out)]) == 0
     assert weights.load(again).meta["start"] == weights.load(out).digest
+    third = tmp_path / "third.safetensors"
+    assert main([*command[:-1], str(third), "--steps", "1", "--batch", "2", "--start", str(again)]) == 0
+    told = weights.legs(weights.load(third).meta)
+    assert [leg["start"] for leg in told] == [None, weights.load(out).digest, weights.load(again).digest]
+    assert [leg["crops"] for leg in told] == [4, 4, 2]
     assert main([*command, "--steps", "3", "--batch", "2"]) == 2
     assert "another training" in capsys.readouterr().err.splitlines()[-1]
     assert out.read_bytes() == before

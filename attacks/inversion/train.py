@@ -84,11 +84,13 @@ def take_part(team: Team, plan: Plan, out: Path, log: Path | None) -> dict[str, 
     sample = encode([(first := held_out.whole(unseen[0], np.random.default_rng(0))).release], [first.condition], slots, encoding)
     one_by_one = slots if encoding == "invariant" and defense.releases is WordSets else 0
     shape = Shape(inputs=sample.values.shape[1], candidates=one_by_one, length=length, widths=plan.widths)
+    start = None if plan.start is None else weights.load(plan.start)
     meta = {
         **weights.describe(defense, dict(plan.served), extractor, Public()),
         "encoding": encoding,
         "slots": slots,
-        "start": None if plan.start is None else weights.load(plan.start).digest,
+        "start": start and start.digest,
+        "earlier": [] if start is None else weights.legs(start.meta),
         "photographs": len(photographs_of(views)),
         "crops": training.steps * training.batch,
         "batch": training.batch,
@@ -103,9 +105,9 @@ def take_part(team: Team, plan: Plan, out: Path, log: Path | None) -> dict[str, 
         _same_training(out, done, meta)
         return done
     trainer = _Trainer(team, shape, training, out, meta, written)
-    if plan.start is not None and trainer.step == 0:
+    if start is not None and trainer.step == 0:
         read_as_descriptors = slots if defense.releases is WordSets and not one_by_one else 1
-        trainer.start_from(weights.load(plan.start).module, read_as_descriptors)
+        trainer.start_from(start.module, read_as_descriptors)
     module = trainer.run(examples)
     if not team.leads:
         return meta

@@ -20,6 +20,7 @@ from bench.public import Public
 
 KIND = "inversion-network"
 TOLD = ("defense", "encoding", "extractor", "serves", "shape", "slots")  # what metadata must say for a network to be used
+LEG = ("start", "crops", "batch", "photographs", "rate", "symmetries")  # what is told of each training of several
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,6 +109,11 @@ def start_from(fresh: Inverter, trained: Inverter, candidates: int) -> None:
     new[first].zero_()
     new[first][:, : candidates * places] = (old[first][:, :places] / candidates**0.5).repeat(1, candidates)
     new[first][:, slots * places : slots * places + 2] = old[first][:, places:]
+
+
+def legs(meta: dict[str, Any]) -> list[dict[str, Any]]:
+    """The trainings that made a network, each from where the one before ended, the first one first, as its metadata say them."""
+    return [*meta.get("earlier", []), {what: meta.get(what) for what in LEG}]
 
 
 def describe(defense: Defense, served: dict[str, Between | OneOf], extractor: Extractor, public: Public) -> dict[str, Any]:
