@@ -456,6 +456,24 @@ def test_weights_that_do_not_fit(spoil, message, tmp_path):
         weights.load(path)
 
 
+def test_what_half_precision_cannot_hold_is_kept_whole(tmp_path, rng):
+    """A batch norm's variance above 65,504 would be infinite, and its channel silent."""
+    shape, path = Shape(inputs=130), tmp_path / "W.safetensors"
+    network = Inverter(shape).eval()
+    network.stem[1].running_var.fill_(1e5)
+    network.stem[0].weight.data.mul_(1e5**0.5)  # as training makes it: large, and normed to what it was
+    points = encode([example_releases(rng)[0]], [np.empty(0, np.float32)], 1, "invariant")
+    painted = network(points)
+    weights.save(path, network, shape, OF_RAW)
+    torch.testing.assert_close(weights.load(path).module(points), painted, atol=2e-3, rtol=0)
+    assert path.stat().st_size < 0.51 * sum(4 * value.numel() for value in network.state_dict().values())
+    network.stem[1].running_var.fill_(np.inf)  # the control: what would have been kept
+    assert not torch.allclose(network(points), painted, atol=2e-3, rtol=0)
+    weights.save(path, network, shape, OF_RAW)
+    with pytest.raises(UserError, match=r"stem.1.running_var has numbers that are not finite"):
+        weights.load(path)
+
+
 def test_weights_that_say_too_little(tmp_path):
     shape, path = Shape(inputs=130), tmp_path / "W.safetensors"
     weights.save(path, Inverter(shape), shape, {name: told for name, told in OF_RAW.items() if name != "encoding"})

@@ -37,13 +37,18 @@ class Network:
 
 
 def save(path: Path, module: nn.Module, shape: Shape, meta: dict[str, Any]) -> str:
-    """Write the weights in half precision and return the file's digest."""
+    """Write the weights in half precision, but for tensors that do not fit into it, and return the file's digest."""
     arrays = {
-        name: value.detach().cpu().numpy().astype(np.float16)
-        for name, value in module.state_dict().items()
-        if value.is_floating_point()
+        name: halved(value.detach().cpu().numpy()) for name, value in module.state_dict().items() if value.is_floating_point()
     }
     return tensorfile.save(path, KIND, arrays, {**meta, "shape": asdict(shape)})
+
+
+def halved(array: np.ndarray) -> np.ndarray:
+    """In half precision, or as it is where that has no such numbers: a batch norm's variance may well be above 65,504."""
+    with np.errstate(over="ignore"):
+        half = array.astype(np.float16)
+    return half if np.isfinite(half).all() else array
 
 
 def load(path: Path) -> Network:
@@ -52,7 +57,8 @@ def load(path: Path) -> Network:
     Raises
     ------
     UserError
-        if the file is damaged, says too little of itself, or its tensors are not those of the network that it describes.
+        if the file is damaged, says too little of itself, or its tensors are not those of the network that it describes, or not
+        finite.
     """
     status = path.stat() if path.is_file() else None
     return _load(path, status and (status.st_mtime_ns, status.st_size))
@@ -75,6 +81,8 @@ def _load(path: Path, version: object) -> Network:
         if name not in arrays or arrays[name].shape != tuple(value.shape):
             found = arrays[name].shape if name in arrays else "nothing"
             raise UserError(f"{path}: tensor {name} has shape {found}, expected {tuple(value.shape)}")
+        if not np.isfinite(arrays[name]).all():
+            raise UserError(f"{path}: tensor {name} has numbers that are not finite; train the network anew")
         value.copy_(torch.from_numpy(arrays[name].astype(np.float32)))
     module.eval().to(pick_device(), memory_format=torch.channels_last)  # type: ignore[call-overload]
     return Network(module, meta, digest)
