@@ -24,7 +24,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--work", type=Path, required=True, help="kept between runs; what is done is not done again")
     parser.add_argument("--steps", type=int, default=17_800, help="of the common start, each of 8 crops")
-    parser.add_argument("--own-steps", type=int, default=1500, help="of each network from there, and of that for positions")
+    parser.add_argument("--own-steps", type=int, default=4500, help="of each network from there, and of that for positions")
     parser.add_argument("--oriented-steps", type=int, default=16_800, help="of the network for oriented descriptors")
     args = parser.parse_args()
     folders = part(args.data, args.work / "photographs")
@@ -35,7 +35,7 @@ def main() -> None:
     given = ["--images", folders["012"], *unseen]
     start = made(args.work / "start.safetensors", "train", "--defense", "none", *given, "--steps", args.steps)
     for name in DEFENSES:
-        own = ["--images", folders["2"], *unseen, "--start", start, "--steps", args.own_steps, "--rate", 1e-3]
+        own = ["--images", folders["2"], *unseen, "--start", start, "--steps", args.own_steps, "--rate", 2e-3]
         ship(made(args.work / f"inversion-{name}.safetensors", "train", "--defense", name, *own))
     alone = {
         "positions": ["--encoding", "positions", "--steps", args.own_steps],
