@@ -403,7 +403,7 @@ def page(records: Sequence[dict[str, Any]]) -> str:
             sizes = f"{record['crops']:,}", f"{record['parameters'] / 1e6:.1f} M"
             lines.append(markdown_row((record["idea"], *scores, *sizes, record["trained_on"], record["date"])))
     alone = [record for record in records if record["upright"] and not record.get("start")]
-    lines += ["", "## How the gap closes", "", "From random weights, upright, painted once."]
+    lines += ["", "## How the gap closes", "", "Painted once; upright, from random weights, where nothing else is said."]
     for idea in (UNCHANGED, UNTURNED):
         whole = [record for record in alone if record["idea"] == idea]
         fewer = [record for record in alone if record["idea"] in (f"{idea}; 200 photographs", f"{idea}; 400 photographs")]
@@ -413,11 +413,13 @@ def page(records: Sequence[dict[str, Any]]) -> str:
         lines += extrapolation(
             f"{idea.capitalize()}, the more photographs, in {longest / 60:g} minutes", fewer + same, "trained_on"
         )
-    first = [record for record in alone if record["idea"] == UNTURNED]
-    # `before`: the crops that its start had seen, in rows of `bench train`, which are added by hand.
-    later = [record for record in records if record["upright"] and "before" in record]
-    legs = [*first, *(record | {"crops": record["before"] + record["crops"]} for record in later)]
-    lines += extrapolation("Leg by leg, the first not turned, the more crops in all", legs, "crops") if later else []
+    for upright, first in ((True, UNTURNED), (False, f"{UNTURNED}; oriented")):
+        same = [record for record in records if record["upright"] == upright]
+        legs = [record for record in same if record["idea"] == first and not record.get("start")]
+        # `before`: the crops that its start had seen, in rows of `bench train`, which are added by hand.
+        legs += [record | {"crops": record["before"] + record["crops"]} for record in same if "before" in record]
+        kind = "upright" if upright else "oriented"
+        lines += extrapolation(f"Leg by leg, {kind}, the first not turned, the more crops in all", legs, "crops")
     return "\n".join(lines) + "\n"
 
 

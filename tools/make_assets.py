@@ -25,7 +25,7 @@ def main() -> None:
     parser.add_argument("--work", type=Path, required=True, help="kept between runs; what is done is not done again")
     parser.add_argument("--steps", type=int, default=17_800, help="of the common start, each of 8 crops")
     parser.add_argument("--own-steps", type=int, default=4500, help="of each network from there, and of that for positions")
-    parser.add_argument("--oriented-steps", type=int, default=16_800, help="of the network for oriented descriptors")
+    parser.add_argument("--oriented-steps", type=int, default=20_800, help="of the network for oriented descriptors")
     args = parser.parse_args()
     folders = part(args.data, args.work / "photographs")
     for file, photographs, words in (("dictionary", "01", WORDS), ("public-database", "2", PUBLIC_WORDS)):
