@@ -431,7 +431,7 @@ def equal(record: dict[str, Any]) -> tuple[bool, float, str]:
 def extrapolation(told: str, trained: Sequence[dict[str, Any]], by: str) -> list[str]:
     """How scores grow with what is kept under `by`, and how much of it the paper's would take if that went on."""
     ordered, name = sorted(trained, key=lambda one: one[by]), "photographs" if by == "trained_on" else by
-    if len(ordered) < 2:
+    if not ordered or ordered[-1][by] < 2 * ordered[0][by]:  # too near to each other for a line
         return []
     table = [markdown_row((name, "SSIM", "PSNR")), markdown_row(["---"] * 3)]
     table += [markdown_row((f"{one[by]:,}", f"{one['ssim']:.4f}", f"{one['psnr']:.2f}")) for one in ordered]
