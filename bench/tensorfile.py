@@ -25,6 +25,13 @@ def content_digest(kind: str, arrays: Arrays, meta: dict[str, Any]) -> str:
     return "sha256:" + digest.hexdigest()
 
 
+def halved(array: np.ndarray) -> np.ndarray:
+    """In half precision, or as it is where that has no such numbers: a batch norm's variance may well be above 65,504."""
+    with np.errstate(over="ignore"):
+        half = array.astype(np.float16)
+    return half if np.isfinite(half).all() else array
+
+
 def save(path: Path, kind: str, arrays: Arrays, meta: dict[str, Any]) -> str:
     """Write the file in one step (a crash leaves the old one) and return its digest."""
     from safetensors.numpy import save as serialized

@@ -65,17 +65,17 @@ INPUTS = 128 + 2  # a raw descriptor, and the place within a cell
 def loss(
     painted: Tensor,
     photograph: Tensor,
-    dissimilarity: float,
-    l1: float,
-    rmse: float,
-    psnr: float,
-    coarse: float,
-    gradient: float,
-    classifier: float,
-    vgg: float,
+    dissimilarity: float = WEIGHT,
+    l1: float = 1.0,
+    rmse: float = 0.0,
+    psnr: float = 0.0,
+    coarse: float = 0.0,
+    gradient: float = 0.0,
+    classifier: float = 0.0,
+    vgg: float = 0.0,
 ) -> Tensor:
     """A weighted sum: 1 - SSIM of luminance, L1, root and logarithm of each image's square error, L1 of four coarser scales, of
-    differences between neighbouring pixels, and of what a classifier sees, or VGG."""
+    differences between neighbouring pixels, and of what a classifier sees, or VGG. By default it is `bench train`'s."""
     luma = torch.tensor(LUMA, device=painted.device).view(1, 3, 1, 1)
     total = dissimilarity * (1 - ssim((painted * luma).sum(dim=1), (photograph * luma).sum(dim=1)))
     total = total + l1 * (painted - photograph).abs().mean()
@@ -228,7 +228,7 @@ class Idea:
         return Attentive(shape, self.attention) if self.attention else Inverter(shape)
 
     def measured(self, painted: Tensor, photograph: Tensor) -> Tensor:
-        return loss(painted, photograph, **AS_IT_IS | self.loss)
+        return loss(painted, photograph, **self.loss)
 
     def drawn(self, examples: Examples, rng: np.random.Generator) -> Example:
         example = examples.draw(rng)
@@ -236,16 +236,6 @@ class Idea:
         return relit(example, self.relit, rng) if self.relit else example
 
 
-AS_IT_IS = {
-    "dissimilarity": WEIGHT,
-    "l1": 1.0,
-    "rmse": 0.0,
-    "psnr": 0.0,
-    "coarse": 0.0,
-    "gradient": 0.0,
-    "classifier": 0.0,
-    "vgg": 0.0,
-}
 IDEAS = {
     UNCHANGED: Idea(),
     "loss: rmse for l1": Idea(loss={"l1": 0.0, "rmse": 1.0}),

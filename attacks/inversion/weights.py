@@ -39,16 +39,11 @@ class Network:
 def save(path: Path, module: nn.Module, shape: Shape, meta: dict[str, Any]) -> str:
     """Write the weights in half precision, but for tensors that do not fit into it, and return the file's digest."""
     arrays = {
-        name: halved(value.detach().cpu().numpy()) for name, value in module.state_dict().items() if value.is_floating_point()
+        name: tensorfile.halved(value.detach().cpu().numpy())
+        for name, value in module.state_dict().items()
+        if value.is_floating_point()
     }
     return tensorfile.save(path, KIND, arrays, {**meta, "shape": asdict(shape)})
-
-
-def halved(array: np.ndarray) -> np.ndarray:
-    """In half precision, or as it is where that has no such numbers: a batch norm's variance may well be above 65,504."""
-    with np.errstate(over="ignore"):
-        half = array.astype(np.float16)
-    return half if np.isfinite(half).all() else array
 
 
 def load(path: Path) -> Network:

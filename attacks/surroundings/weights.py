@@ -28,8 +28,8 @@ class Network:
 
 
 def save(path: Path, module: Surroundings, meta: dict[str, Any]) -> str:
-    """Write the weights in half precision and return the file's digest."""
-    arrays = {name: value.cpu().numpy().astype(np.float16) for name, value in module.state_dict().items()}
+    """Write the weights in half precision, but for tensors that do not fit into it, and return the file's digest."""
+    arrays = {name: tensorfile.halved(value.cpu().numpy()) for name, value in module.state_dict().items()}
     return tensorfile.save(path, KIND, arrays, {**meta, "shape": asdict(module.shape)})
 
 
