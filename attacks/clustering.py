@@ -17,12 +17,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.errors import UserError
-from bench.kernels.search import unit_rows
-from bench.kernels.sharing import Company, company, nearest_that_meet
-from bench.kernels.subspaces import Doubles, feet_and_frames, nearest_to_subspaces
-from bench.plugin import Asset, Defense, DescriptorAttack, Extractor, View, leads_through_no_word, lifted
-from bench.public import Public
+from bench.api import Asset, Defense, DescriptorAttack, Extractor, View, leads_through_no_word, lifted
+from bench.codebook.public import Public
+from bench.core.errors import UserError
+from bench.geometry.nearest_words import unit_rows
+from bench.geometry.shared_sub_database import Company, company, nearest_that_meet
+from bench.geometry.subspaces import Doubles, feet_and_frames, nearest_to_subspaces
 from bench.types import Bytes, Floats, Indices, Knowledge, Subspaces
 
 BATCH = 64  # subspaces whose words are gathered at a time

@@ -15,12 +15,12 @@ from typing import Literal
 import numpy as np
 import torch
 
-from attacks.inversion.weights import misfit
-from attacks.surroundings.network import Belief
-from attacks.surroundings.scenes import prior_odds, scene
-from attacks.surroundings.weights import Network, load
-from bench.plugin import Asset, Defense, DescriptorAttack, Extractor, View
-from bench.public import ASSETS, Public
+from bench.api import Asset, Defense, DescriptorAttack, Extractor, View
+from bench.codebook.public import ASSETS, Public
+from bench.context.encoding import prior_odds, scene
+from bench.context.network import Belief
+from bench.context.weights import Network, load
+from bench.inversion.weights import misfit
 from bench.types import Floats, Knowledge, WordSets
 
 ESTIMATES = {"word": Belief.word, "mean": Belief.mean}

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.errors import UserError
-from bench.kernels.estimates import estimate
-from bench.kernels.subspaces import nearest_to_subspaces
-from bench.plugin import Defense, DescriptorAttack, Extractor, View, leads_through_no_word, lifted
-from bench.public import Public
+from bench.api import Defense, DescriptorAttack, Extractor, View, leads_through_no_word, lifted
+from bench.codebook.public import Public
+from bench.core.errors import UserError
+from bench.geometry.estimates import estimate
+from bench.geometry.subspaces import nearest_to_subspaces
 from bench.types import Floats, Knowledge, Subspaces
 
 

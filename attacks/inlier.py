@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.errors import UnitError
-from bench.localization import matching
-from bench.plugin import Selection, SelectiveAttack, View
+from bench.api import Selection, SelectiveAttack, View
+from bench.core.errors import UnitError
+from bench.localization import map_matching
 from bench.types import Descriptors, Knowledge, Subspaces, WordSets
 
 
@@ -31,7 +31,7 @@ class Inlier(SelectiveAttack):
 
     def select(self, view: View, rng: np.random.Generator) -> Selection:
         server = view.know(Knowledge.MAP)
-        matcher = matching.default(view.defense)
+        matcher = map_matching.default(view.defense)
         if matcher is None:
             raise UnitError(f"nothing matches {type(view.release).__name__}")
         if isinstance(view.release, Subspaces):

@@ -12,15 +12,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.errors import UserError
-from bench.kernels.estimates import estimate
-from bench.kernels.meetings import meetings_within
-from bench.kernels.rebuilding import rebuilt
-from bench.kernels.search import unit_rows
-from bench.kernels.sharing import company
-from bench.kernels.subspaces import feet_and_frames, nearest_to_subspaces
-from bench.plugin import Defense, DescriptorAttack, Extractor, View, leads_through_no_word, lifted
-from bench.public import Public
+from bench.api import Defense, DescriptorAttack, Extractor, View, leads_through_no_word, lifted
+from bench.codebook.public import Public
+from bench.core.errors import UserError
+from bench.geometry.database_reconstruction import rebuilt
+from bench.geometry.estimates import estimate
+from bench.geometry.intersections import meetings_within
+from bench.geometry.nearest_words import unit_rows
+from bench.geometry.shared_sub_database import company
+from bench.geometry.subspaces import feet_and_frames, nearest_to_subspaces
 from bench.types import Bytes, Floats, Knowledge, Subspaces
 
 

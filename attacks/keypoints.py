@@ -11,12 +11,12 @@ from pathlib import Path
 
 import numpy as np
 
-from attacks.inversion.painting import painted
-from attacks.inversion.symmetry import OF_POSITIONS
-from attacks.inversion.weights import Network, load, other_features
-from bench.errors import UserError
-from bench.plugin import Asset, Defense, Extractor, ImageAttack, View
-from bench.public import ASSETS, Public
+from bench.api import Asset, Defense, Extractor, ImageAttack, View
+from bench.codebook.public import ASSETS, Public
+from bench.core.errors import UserError
+from bench.inversion.reconstruct import painted
+from bench.inversion.symmetry import OF_POSITIONS
+from bench.inversion.weights import Network, load, other_features
 from bench.types import Descriptors, Floats, Knowledge, Subspaces, WordSets
 
 

@@ -1,12 +1,12 @@
 """Lattice, an attack that is in no paper: it knows nothing but that descriptors are 8-bit vectors, scaled to unit norm.
 
 D was made from the secret, from words of a database and from random directions. The secret and the words are multiples of
-8-bit vectors; nothing else in D is, for the directions are random. `bench/kernels/lattice.py` finds all of them from the
+8-bit vectors; nothing else in D is, for the directions are random. `bench/geometry/lattice.py` finds all of them from the
 release's float32: the descriptor and the adversarial words, dim / 2 + 1 candidates for a hybrid lifting, dim + 1 for an
 adversarial one, and for a random one the descriptor alone. Neither the random directions nor the dimension are a hindrance,
 and zeros are not needed.
 
-Which candidate is the descriptor is left to tell (`bench/kernels/candidates.py`), and is all that such a lifting hides. A
+Which candidate is the descriptor is left to tell (`bench/geometry/candidates.py`), and is all that such a lifting hides. A
 database of centres of large clusters hides nothing. Of raw descriptors, only those are known that come twice in a photograph.
 An attacker who has the database need not guess: he strikes out its words.
 
@@ -22,11 +22,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.kernels.candidates import most_genuine
-from bench.kernels.lattice import unit_integer_points
-from bench.kernels.subspaces import guesses
-from bench.plugin import Defense, DescriptorAttack, Extractor, View
-from bench.public import Public
+from bench.api import Defense, DescriptorAttack, Extractor, View
+from bench.codebook.public import Public
+from bench.geometry.candidates import most_genuine
+from bench.geometry.lattice import unit_integer_points
+from bench.geometry.subspaces import guesses
 from bench.types import Floats, Subspaces
 
 

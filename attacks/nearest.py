@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.kernels.search import unit_rows
-from bench.kernels.subspaces import nearest_to_subspaces
-from bench.plugin import Asset, DescriptorAttack, View
+from bench.api import Asset, DescriptorAttack, View
+from bench.geometry.nearest_words import unit_rows
+from bench.geometry.subspaces import nearest_to_subspaces
 from bench.types import Floats, Knowledge, Subspaces
 
 

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.errors import UserError
-from bench.kernels.pairs import directions
-from bench.kernels.repeats import common_points, likeliest
-from bench.plugin import DescriptorAttack, View
+from bench.api import DescriptorAttack, View
+from bench.core.errors import UserError
+from bench.core.metric_inputs import directions
+from bench.mechanisms.multi_release import common_points, likeliest
 from bench.types import Floats, Indices, Knowledge, Release, Subspaces, WordSets
 
 

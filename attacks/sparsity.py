@@ -2,8 +2,8 @@
 
 The points of D that are nowhere negative are a polytope, and a vertex of it is where dim components vanish. SIFT has a median
 of about 20 zeros in 128, so that the secret is a *degenerate* vertex, where more vanish. Chance makes no such vertex of unit
-norm: one that is found is the secret, or a word of the database that is as sparse (`bench/kernels/candidates.py` says which
-is taken). A walk over vertices by linear programming finds them (`bench/kernels/vertices.py`).
+norm: one that is found is the secret, or a word of the database that is as sparse (`bench/geometry/candidates.py` says which
+is taken). A walk over vertices by linear programming finds them (`bench/geometry/vertices.py`).
 
 Where it fails: at descriptors of dim zeros or fewer, which are no degenerate vertex; at those of few more, for few objectives
 lead to them; and where words of the database are sparse as well, above all if they are raw descriptors. Where no vertex was
@@ -19,13 +19,13 @@ from dataclasses import dataclass
 import numpy as np
 from torch import Tensor
 
-from bench.errors import UserError
-from bench.kernels.candidates import EQUAL, most_genuine
-from bench.kernels.search import unit_rows
-from bench.kernels.subspaces import guesses
-from bench.kernels.vertices import unit_vertices
-from bench.plugin import Defense, DescriptorAttack, Extractor, View
-from bench.public import Public
+from bench.api import Defense, DescriptorAttack, Extractor, View
+from bench.codebook.public import Public
+from bench.core.errors import UserError
+from bench.geometry.candidates import EQUAL, most_genuine
+from bench.geometry.nearest_words import unit_rows
+from bench.geometry.subspaces import guesses
+from bench.geometry.vertices import unit_vertices
 from bench.types import Floats, Indices, Subspaces
 
 

@@ -13,16 +13,16 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from bench.protection import protect
-    from bench.records import load_records
-    from bench.runner import run
+    from bench.mechanisms.protection import protect
+    from bench.runner.plan import run
+    from bench.runner.records import load_records
 
     __version__: str
 
 __all__ = ["__version__", "load_records", "protect", "run"]
 
 # Imported when first used, so that `import bench` and `bench --help` cost nothing.
-_HOMES = {"protect": "bench.protection", "load_records": "bench.records", "run": "bench.runner"}
+_HOMES = {"protect": "bench.mechanisms.protection", "load_records": "bench.runner.records", "run": "bench.runner.plan"}
 
 
 def __getattr__(name: str) -> Any:

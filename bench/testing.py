@@ -17,12 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from bench import cache, tensorfile
-from bench.datasets import photographs
-from bench.datasets.photographs import SIDE
-from bench.features import dictionary, kept
-from bench.kernels.search import unit_rows
-from bench.plugin import (
+from bench.api import (
     Asset,
     Attack,
     Dataset,
@@ -36,10 +31,16 @@ from bench.plugin import (
     Task,
     Trial,
 )
-from bench.public import Public
+from bench.cache import feature_cache, store
+from bench.codebook import dictionary
+from bench.codebook.public import Public
+from bench.formats import tensor_file
+from bench.geometry.nearest_words import unit_rows
+from bench.images import photographs
+from bench.images.photographs import SIDE
+from bench.images.samples import Unit
 from bench.tasks.reconstruction import Reconstruction, view
 from bench.types import Descriptors, Features, Floats, Indices, Release, Subspaces, WordSets
-from bench.units import Unit
 
 TOLERANCE = 1e-5  # of norms and angles in float32
 
@@ -103,7 +104,7 @@ def check_attack(attack: Attack, defense: Defense, extractor: Extractor, secret:
 
     What it returns must be bit-identical when the secret and the caches are overwritten after the release, those on disk too.
     """
-    with tempfile.TemporaryDirectory() as folder, cache.within(Path(folder)):
+    with tempfile.TemporaryDirectory() as folder, store.within(Path(folder)):
         _check_attack(attack, defense, extractor, secret)
 
 
@@ -111,11 +112,11 @@ def _check_attack(attack: Attack, defense: Defense, extractor: Extractor, secret
     cached: list[Indices] = []
 
     def quantise(known: dictionary.Dictionary, rows: Any) -> Indices:
-        cached.append(kept.nearest_words(known, rows))
+        cached.append(feature_cache.nearest_words(known, rows))
         return cached[-1]
 
     public = Public(quantise)
-    cache.fetch(kept.KIND, "the secret", lambda: (kept.to_arrays(secret), {"size": list(secret.size)}))
+    store.fetch(feature_cache.KIND, "the secret", lambda: (feature_cache.to_arrays(secret), {"size": list(secret.size)}))
     mine = copy.deepcopy(secret)
     strangers = [example_features(len(secret), seed) for seed in range(5, 8)]
 
@@ -145,7 +146,7 @@ def _check_attack(attack: Attack, defense: Defense, extractor: Extractor, secret
     assert first.dtype == np.float32
     for array in (*_arrays(mine), *cached):
         array[...] = 0
-    for entry in cache.entries():
+    for entry in store.entries():
         overwrite(entry.path, entry.kind)
     public.forget()
     assert np.array_equal(first, _estimate(trial)), "the attack saw more than the release"
@@ -191,8 +192,8 @@ def check_extractor(extractor: Extractor, image: np.ndarray, source: Path | None
 
 def overwrite(file: Path, kind: str) -> None:
     """Put zeros in the place of all numbers of a file of arrays, as if they were what had been written."""
-    arrays, meta, _ = tensorfile.load(file, kind)
-    tensorfile.save(file, kind, {name: np.zeros_like(array) for name, array in arrays.items()}, meta)
+    arrays, meta, _ = tensor_file.load(file, kind)
+    tensor_file.save(file, kind, {name: np.zeros_like(array) for name, array in arrays.items()}, meta)
 
 
 def check_task(task: Task, defense: Defense, extractor: Extractor, secret: Features) -> None:

@@ -13,11 +13,11 @@ from typing import ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.errors import UnitError, UserError
-from bench.kernels.search import unit_rows
-from bench.kernels.subset import draw_distinct
-from bench.plugin import Asset, Between, Lifted, Lifting, OneOf, Privacy
-from bench.public import Public
+from bench.api import Asset, Between, Lifted, Lifting, OneOf, Privacy
+from bench.codebook.public import Public
+from bench.core.errors import UnitError, UserError
+from bench.geometry.nearest_words import unit_rows
+from bench.mechanisms.subset import draw_distinct
 from bench.types import Bytes, Features, Floats, Indices, Subspaces
 
 Doubles = NDArray[np.float64]

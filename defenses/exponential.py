@@ -13,7 +13,7 @@ For m words, they are drawn one after the other, each from those that are left, 
 very mechanism on fewer words, so that the m of them compose to ε. Which came first is not told.
 
 Nothing in the proof rests on how u is rounded, as long as it is a function of v and w; here it is one of whole numbers,
-whatever the machine (`bench.kernels.neighbours`). The draw is exact (`bench.kernels.graded`), in blocks of words, one pass over
+whatever the machine (`bench.geometry.neighbours`). The draw is exact (`bench.mechanisms.graded`), in blocks of words, one pass over
 the dictionary.
 """
 
@@ -26,13 +26,13 @@ from typing import ClassVar
 
 import numpy as np
 
-from bench.errors import UserError
-from bench.exact import exact
-from bench.features.dictionary import Dictionary
-from bench.kernels.graded import graded_words
-from bench.kernels.search import unit_rows
-from bench.plugin import Asset, Between, Defense, OneOf, Privacy
-from bench.public import Public
+from bench.api import Asset, Between, Defense, OneOf, Privacy
+from bench.codebook.dictionary import Dictionary
+from bench.codebook.public import Public
+from bench.core.errors import UserError
+from bench.core.exact import exact
+from bench.geometry.nearest_words import unit_rows
+from bench.mechanisms.graded import graded_words
 from bench.types import Features, WordSets
 
 

@@ -16,7 +16,7 @@ One word is drawn, with Pr(w | v) = e^(−ε d(v, w) / 2) / N(v). d is the dista
 terms of N, and N; the quotient by e^(ε d(v1, v2)). ∎
 
 Distances are computed from whole numbers, to within `SLACK`; the metric of the promise is the distance plus twice that, rounded
-up, which covers that a rounded distance falls on the wrong side of a step. The draw is exact (`bench.kernels.graded`).
+up, which covers that a rounded distance falls on the wrong side of a step. The draw is exact (`bench.mechanisms.graded`).
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from typing import ClassVar
 
 import numpy as np
 
-from bench.errors import UserError
-from bench.exact import exact
-from bench.kernels.graded import graded_words
-from bench.kernels.search import unit_rows
-from bench.plugin import Asset, Between, Defense, OneOf, Privacy
-from bench.public import Public
+from bench.api import Asset, Between, Defense, OneOf, Privacy
+from bench.codebook.public import Public
+from bench.core.errors import UserError
+from bench.core.exact import exact
+from bench.geometry.nearest_words import unit_rows
+from bench.mechanisms.graded import graded_words
 from bench.types import Features, WordSets
 
 SLACK = 2e-6  # of distance: cosines are off by 1e-15, and what is nearer to 1 than TOGETHER has distance zero

@@ -15,11 +15,11 @@ from typing import Literal
 
 import numpy as np
 
-from bench.errors import UserError
-from bench.kernels.search import unit_rows
-from bench.kernels.subset import log10_chance, pattern_subsets
-from bench.plugin import Defense, Privacy
-from bench.public import Public
+from bench.api import Defense, Privacy
+from bench.codebook.public import Public
+from bench.core.errors import UserError
+from bench.geometry.nearest_words import unit_rows
+from bench.mechanisms.subset import log10_chance, pattern_subsets
 from bench.types import Bytes, Features, Floats, WordSets
 
 LENGTH = 128  # of a descriptor; |K| rests on it

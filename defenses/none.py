@@ -7,9 +7,9 @@ from typing import Literal
 
 import numpy as np
 
-from bench.errors import UserError
-from bench.plugin import Defense, Privacy
-from bench.public import Public
+from bench.api import Defense, Privacy
+from bench.codebook.public import Public
+from bench.core.errors import UserError
 from bench.types import Descriptors, Features, Floats
 
 COLUMNS = {"positions": 0, "scale": 1, "scale-and-orientation": 2}  # of `Features.frames`

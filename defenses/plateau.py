@@ -28,13 +28,13 @@ from typing import ClassVar
 
 import numpy as np
 
-from bench.errors import UserError
-from bench.features.dictionary import Dictionary
-from bench.kernels.classes import draw_classes
-from bench.kernels.search import unit_rows
-from bench.kernels.subset import draw_distinct, draw_told, log10_chance
-from bench.plugin import Asset, Between, Defense, OneOf, Privacy
-from bench.public import Public
+from bench.api import Asset, Between, Defense, OneOf, Privacy
+from bench.codebook.dictionary import Dictionary
+from bench.codebook.public import Public
+from bench.core.errors import UserError
+from bench.geometry.nearest_words import unit_rows
+from bench.mechanisms.classes import draw_classes
+from bench.mechanisms.subset import draw_distinct, draw_told, log10_chance
 from bench.types import Features, Indices, WordSets
 
 

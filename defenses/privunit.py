@@ -17,7 +17,7 @@ over words.
 Descriptors have nothing negative and crowd about their mean. With `centred`, u is what of the descriptor is at right angles to
 the mean direction of a public dictionary, and n is one less; a function of the descriptor, so nothing of the proof changes.
 
-The coin is exact, with q a multiple of 2^-64 (`bench.kernels.subset`). The vector is not: a sphere has no exact draw. γ and the
+The coin is exact, with q a multiple of 2^-64 (`bench.mechanisms.subset`). The vector is not: a sphere has no exact draw. γ and the
 projection are doubles, which move the densities by about 1e-12 of themselves; and each number of the result is rounded to a
 multiple of 2^-12 before it is scaled to unit norm, which cuts off the bits in which sums of doubles tell what they are sums of
 (Mironov, CCS 2012). So ε is kept as far as doubles can be taken for real numbers, and not beyond, as it is by mechanisms over
@@ -37,11 +37,11 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from scipy.special import betainc, betaincinv, betaln
 
-from bench.errors import UserError
-from bench.kernels.search import unit_rows
-from bench.kernels.subset import draw_told
-from bench.plugin import Asset, Between, Defense, OneOf, Privacy
-from bench.public import Public
+from bench.api import Asset, Between, Defense, OneOf, Privacy
+from bench.codebook.public import Public
+from bench.core.errors import UserError
+from bench.geometry.nearest_words import unit_rows
+from bench.mechanisms.subset import draw_told
 from bench.types import Descriptors, Features
 
 Doubles = NDArray[np.float64]

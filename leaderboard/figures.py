@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from PIL import Image
 
-from bench.records import Record
+from bench.runner.records import Record
 from bench.types import Bytes
 from leaderboard.tables import labels, spaced
 

@@ -13,9 +13,9 @@ from typing import Literal
 
 import numpy as np
 
-from bench import registry
-from bench.listing import described
-from leaderboard.reproduce.intervals import Interval, interval, proportion
+from bench.registry import discovery
+from bench.registry.listing import described
+from leaderboard.intervals import Interval, interval, proportion
 from leaderboard.tables import MEDIANS, PAPER
 
 PRIVACY = "ssim"  # what attacks are compared by: how much of the photograph comes back
@@ -83,7 +83,7 @@ _OF_TASKS = (
 
 
 def _of_plugins() -> Iterator[Measure]:
-    for plugin in registry.everything(registry.METRIC):
+    for plugin in discovery.everything(discovery.METRIC):
         name = plugin.name()
         better = -1 if plugin.higher_is_better_for == "attacker" else 1
         yield Measure(name, name.upper() if name in PAPER else name, better, "mean", described(plugin))

@@ -6,13 +6,13 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
-from bench.records import canonical
-from leaderboard.boards import Board
+from bench.runner.records import canonical
+from leaderboard.comparison import Board
 from leaderboard.figures import drawable
-from leaderboard.marks import Mark, marks, place_labels
+from leaderboard.intervals import Interval
 from leaderboard.measures import PRIVACY, measures
+from leaderboard.plot_style import Mark, marks, place_labels
 from leaderboard.ranking import Standing, standings
-from leaderboard.reproduce.intervals import Interval
 from leaderboard.tables import labels, setting
 from leaderboard.tradeoff import Tradeoff
 

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from bench.records import canonical
-from leaderboard.boards import Board, Cell
+from bench.runner.records import canonical
+from leaderboard.comparison import Board, Cell
+from leaderboard.intervals import Interval
 from leaderboard.measures import PRIVACY, Measure, measures
-from leaderboard.reproduce.intervals import Interval
 
 # The attack whose network is trained for the very defense. Attackers that were made for another one make a defense look safe.
 ADAPTED = "dia"

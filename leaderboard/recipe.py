@@ -8,13 +8,13 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from bench import fields, registry
-from bench.errors import UserError
-from bench.plugin import Defense, Plugin, Task
-from bench.public import ASSETS, SHIPPED
-from bench.records import Record
-from bench.registry import Kind
-from leaderboard.boards import Cell
+from bench.api import Defense, Plugin, Task
+from bench.codebook.public import ASSETS, SHIPPED
+from bench.core.errors import UserError
+from bench.registry import discovery, fields
+from bench.registry.discovery import Kind
+from bench.runner.records import Record
+from leaderboard.comparison import Cell
 
 BUILTIN = "builtin"  # the photographs that need no --images
 Lookup = Callable[[Kind, str], type[Plugin] | None]
@@ -32,7 +32,7 @@ class Recipe:
 def installed(kind: Kind, name: str) -> type[Plugin] | None:
     """The plugin of that name, if it is here."""
     try:
-        found: type[Plugin] = registry.lookup(kind, name)
+        found: type[Plugin] = discovery.lookup(kind, name)
     except UserError:
         return None
     return found
@@ -47,14 +47,14 @@ def recipe(cell: Cell, lookup: Lookup = installed) -> Recipe:
     needs: dict[str, None] = {}
     task = {"name": head["task"], **(head.get("task_settings") or {})}
     options = [
-        ("--task", spec(registry.TASK, task, needs)),
-        ("--defense", spec(registry.DEFENSE, head["defense"], needs, _made_there(lookup, head))),
+        ("--task", spec(discovery.TASK, task, needs)),
+        ("--defense", spec(discovery.DEFENSE, head["defense"], needs, _made_there(lookup, head))),
     ]
     if head["attack"] is not None:
-        options.append(("--attack", spec(registry.ATTACK, head["attack"], needs)))
-    options.append(("--extractor", spec(registry.EXTRACTOR, head["dataset"]["extractor"], needs)))
+        options.append(("--attack", spec(discovery.ATTACK, head["attack"], needs)))
+    options.append(("--extractor", spec(discovery.EXTRACTOR, head["dataset"]["extractor"], needs)))
     if head["dataset"].get("spec"):
-        options.append(("--dataset", spec(registry.DATASET, head["dataset"]["spec"], needs)))
+        options.append(("--dataset", spec(discovery.DATASET, head["dataset"]["spec"], needs)))
     elif head["dataset"]["name"] != BUILTIN:
         options.append(("--images", str(head["dataset"]["name"])))
         needs[f"{head['dataset']['name']}: a folder of the photographs with the content {head['dataset']['hash']}"] = None
@@ -71,7 +71,7 @@ def _option(name: str, text: str) -> str:
 
 def _made_there(lookup: Lookup, head: Record) -> str | None:
     """The field of the defense that is filled in with a dictionary of the place, if the task is about one."""
-    task, defense = lookup(registry.TASK, head["task"]), lookup(registry.DEFENSE, head["defense"]["name"])
+    task, defense = lookup(discovery.TASK, head["task"]), lookup(discovery.DEFENSE, head["defense"]["name"])
     about_places = task is not None and issubclass(task, Task) and task.places
     return defense.quantised_by if about_places and defense is not None and issubclass(defense, Defense) else None
 
@@ -79,9 +79,9 @@ def _made_there(lookup: Lookup, head: Record) -> str | None:
 def _metrics(lookup: Lookup, settings: Mapping[str, Mapping[str, Any]], needs: dict[str, None]) -> Iterator[str]:
     """Those that are measured only where they are asked for."""
     for name, content in settings.items():
-        plugin = lookup(registry.METRIC, name)
+        plugin = lookup(discovery.METRIC, name)
         if plugin and fields.without_default(plugin):
-            yield _spec(lookup, registry.METRIC, {"name": name, **content}, needs)
+            yield _spec(lookup, discovery.METRIC, {"name": name, **content}, needs)
 
 
 def _spec(lookup: Lookup, kind: Kind, configuration: Mapping[str, Any], needs: dict[str, None], made: str | None = None) -> str:

@@ -22,9 +22,9 @@ from typing import Any, Literal
 import numpy as np
 from scipy import stats
 
-from bench.records import Record, canonical
+from bench.runner.records import Record, canonical
+from leaderboard.intervals import interval
 from leaderboard.measures import measures
-from leaderboard.reproduce.intervals import interval
 from leaderboard.tables import labels
 
 Verdict = Literal["worse", "weaker", "missing", "better", "new", "same"]  # the gravest first

@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from bench.errors import UserError
+from bench.core.errors import UserError
 from leaderboard.regression import Finding, Verdict
 
 TOLERANCE = 2.0  # times as much as the baseline: what a busy machine makes of it is less

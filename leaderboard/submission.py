@@ -1,6 +1,6 @@
 """Somebody's records, checked: whether they are whole, say what they hash, are possible, and come out again.
 
-A sample of them is made again here. Attacks then run in a process that never holds the secret (`bench.isolation`), so that one
+A sample of them is made again here. Attacks then run in a process that never holds the secret (`bench.runner.attack_process`), so that one
 which looked at what it must not see cannot repeat its numbers.
 """
 
@@ -16,18 +16,20 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from bench import fields, records, registry, runner, spec, trials
-from bench.datasets.photographs import folder
-from bench.errors import UnitError, UserError
-from bench.isolation import isolated
-from bench.plugin import Asset, Plugin, Task
-from bench.progress import Progress
-from bench.public import ASSETS, REFERENCES, SHIPPED
-from bench.records import EVERY_UNIT, Record
-from bench.registry import Kind
-from bench.runner import Asked, Cell, Plan
-from bench.trials import Trials
-from bench.units import Images
+from bench.api import Asset, Plugin, Task
+from bench.codebook.public import ASSETS, REFERENCES, SHIPPED
+from bench.core.errors import UnitError, UserError
+from bench.core.progress import Progress
+from bench.images.photographs import folder
+from bench.images.samples import Images
+from bench.registry import discovery, fields, spec
+from bench.registry.discovery import Kind
+from bench.runner import plan as runner
+from bench.runner import records, trial
+from bench.runner.attack_process import isolated
+from bench.runner.plan import Asked, Cell, Plan
+from bench.runner.records import EVERY_UNIT, Record
+from bench.runner.trial import Trials
 from leaderboard.regression import ABSOLUTE_FLOOR, RELATIVE_FLOOR
 
 P = TypeVar("P", bound=Plugin)
@@ -134,7 +136,7 @@ def _inconsistent(record: Record) -> Iterator[str]:
         yield f"cell_id: is {record['cell_id']}, but that of this configuration is {right}"
     if (right := records.run_hash(record["cell_id"], record["environment"])) != record["run_hash"]:
         yield f"run_hash: is {record['run_hash']}, but that of this cell and environment is {right}"
-    known = {metric.name(): metric for metric in registry.everything(registry.METRIC)}
+    known = {metric.name(): metric for metric in discovery.everything(discovery.METRIC)}
     for name, value in record["metrics"].items():
         if name in known and value is not None and not known[name].range[0] <= value <= known[name].range[1]:
             low, high = known[name].range
@@ -186,7 +188,7 @@ class _Here:
         UserError
             if it is not installed, or refuses a field.
         """
-        plugin = registry.lookup(kind, configuration["name"])
+        plugin = discovery.lookup(kind, configuration["name"])
         types = fields.field_types(plugin)
         given = {}
         for name in types.keys() & configuration.keys():
@@ -221,18 +223,18 @@ def _plans(lines: Sequence[Line], here: _Here) -> Iterator[list[Planned | Fault]
 
 
 def _asked(record: Record, here: _Here) -> Asked:
-    task: Task = here.plugin(registry.TASK, {"name": record["task"], **record["task_settings"]})
+    task: Task = here.plugin(discovery.TASK, {"name": record["task"], **record["task_settings"]})
     dataset = record["dataset"]["spec"]
-    defense = here.plugin(registry.DEFENSE, record["defense"])
+    defense = here.plugin(discovery.DEFENSE, record["defense"])
     quantised = defense.quantised_by
     if dataset is not None and quantised is not None and record["defense"][quantised] not in here.assets:
         defense = dataclasses.replace(defense, **{quantised: Asset(REFERENCES)})  # type: ignore[type-var]
     return Asked(
-        pairs=((defense, None if record["attack"] is None else here.plugin(registry.ATTACK, record["attack"])),),
+        pairs=((defense, None if record["attack"] is None else here.plugin(discovery.ATTACK, record["attack"])),),
         images=here.photographs(record),
         task=task,
-        extractor=here.plugin(registry.EXTRACTOR, record["dataset"]["extractor"]),
-        dataset=None if dataset is None else here.plugin(registry.DATASET, dataset),
+        extractor=here.plugin(discovery.EXTRACTOR, record["dataset"]["extractor"]),
+        dataset=None if dataset is None else here.plugin(discovery.DATASET, dataset),
         seed=record["seed"],
     )
 
@@ -251,7 +253,7 @@ def _impossible(cell: Cell, members: Sequence[Line], plan: Plan) -> Iterator[Fau
             yield Fault(line.number, f"status: the pair {told}")
         if record["unit"] not in (names if cell.reason is None else {EVERY_UNIT}):
             yield Fault(line.number, f"unit: the dataset has no {record['unit']!r}")
-        right = trials.privacy(cell, record["privacy"]["keypoints"])
+        right = trial.privacy(cell, record["privacy"]["keypoints"])
         for name, value in right.items():
             told = record["privacy"].get(name)
             if not _close(told, value):

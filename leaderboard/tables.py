@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
-from bench import registry
-from bench.composition import DELTA, UNCOVERED
-from bench.listing import described
-from bench.records import Record, canonical, latest
+from bench.mechanisms.composition import DELTA, UNCOVERED
+from bench.registry import discovery
+from bench.registry.listing import described
+from bench.runner.records import Record, canonical, latest
 
 if TYPE_CHECKING:
     from rich.table import Table as RichTable
@@ -159,7 +159,7 @@ def _heading(name: str) -> str:
 
 def explanations(table: Table) -> list[str]:
     """What the numbers are, in lines."""
-    known = {metric.name(): metric for metric in registry.everything(registry.METRIC)}
+    known = {metric.name(): metric for metric in discovery.everything(discovery.METRIC)}
     lines = [f"{name}: {described(known[name])}" for name in table.metrics if name in known]
     return [*lines, COMPOSED, SEEDED]
 
@@ -314,7 +314,7 @@ def _summary(name: str, values: list[float | None]) -> dict[str, float]:
         return {name: _median(math.inf if value is None else value for value in values)}
     if not name.startswith(SHARES) or not values:
         return {name: _mean(values)}
-    from leaderboard.reproduce.intervals import proportion  # which imports this file
+    from leaderboard.intervals import proportion  # which imports this file
 
     share = proportion([value for value in values if value is not None])
     return {name: share.mean, f"{name}_low": share.low, f"{name}_high": share.high}

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bench.records import canonical
-from leaderboard.boards import Board, Cell
+from bench.runner.records import canonical
+from leaderboard.comparison import Board, Cell
+from leaderboard.intervals import Interval
 from leaderboard.measures import PRIVACY, UTILITY, Measure, measures
 from leaderboard.ranking import Standing, standings
-from leaderboard.reproduce.intervals import Interval
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

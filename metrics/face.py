@@ -10,8 +10,8 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from bench.kernels.pairs import Doubles, image_pair
-from bench.plugin import Metric
+from bench.api import Metric
+from bench.core.metric_inputs import Doubles, image_pair
 from bench.types import Floats
 
 

@@ -7,8 +7,8 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from bench.kernels.pairs import descriptor_pair
-from bench.plugin import Metric
+from bench.api import Metric
+from bench.core.metric_inputs import descriptor_pair
 from bench.types import Floats
 
 

@@ -12,9 +12,9 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar, Literal
 
-from bench.errors import UserError
-from bench.kernels.pairs import Doubles, image_pair
-from bench.plugin import Metric
+from bench.api import Metric
+from bench.core.errors import UserError
+from bench.core.metric_inputs import Doubles, image_pair
 from bench.types import Floats
 
 

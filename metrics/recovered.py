@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
-from bench.kernels.pairs import descriptor_pair, directions
-from bench.plugin import Metric
+from bench.api import Metric
+from bench.core.metric_inputs import descriptor_pair, directions
 from bench.types import Floats
 
 

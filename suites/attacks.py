@@ -1,7 +1,7 @@
 """Every attack against every defense that it applies to: who is the strongest."""
 
-from bench import fields, registry
-from bench.suite import Suite, grid
+from bench.registry import discovery, fields
+from bench.runner.suite import Suite, grid
 from defenses.affine import Affine
 from defenses.ldp import LDP
 from defenses.naive_ldp import NaiveLDP
@@ -11,6 +11,6 @@ SUITE = Suite(
     summary="every attack, those of installed packages too, against every defense that it applies to",
     parts=grid(
         defenses=[Undefended(), Affine(), LDP(), LDP(epsilon=16), NaiveLDP()],
-        attacks=[attack() for attack in registry.everything(registry.ATTACK) if not fields.without_default(attack)],
+        attacks=[attack() for attack in discovery.everything(discovery.ATTACK) if not fields.without_default(attack)],
     ),
 )

@@ -1,7 +1,7 @@
 """Everything: all other suites. What they share is done once."""
 
-from bench import suite
-from bench.suite import Suite
+from bench.runner import suite
+from bench.runner.suite import Suite
 
 SUITE = Suite(
     summary="all other suites",

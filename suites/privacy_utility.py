@@ -3,9 +3,9 @@
 from attacks.dia import DIA
 from attacks.keypoints import Keypoints
 from attacks.lattice import Lattice
+from bench.api import Asset
 from bench.datasets.gallery import Gallery
-from bench.plugin import Asset
-from bench.suite import Suite, grid
+from bench.runner.suite import Suite, grid
 from bench.tasks.localization import Localization
 from bench.tasks.reconstruction import Reconstruction
 from defenses.affine import Affine

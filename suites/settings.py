@@ -4,7 +4,7 @@ from attacks.context import Context
 from attacks.database import Database
 from attacks.dia import DIA
 from attacks.lattice import Lattice
-from bench.suite import Suite, grid
+from bench.runner.suite import Suite, grid
 from defenses.affine import Affine
 from defenses.ldp import LDP
 from defenses.none import Undefended

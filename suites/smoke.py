@@ -3,8 +3,8 @@
 from attacks.dia import DIA
 from attacks.keypoints import Keypoints
 from attacks.nearest import Nearest
-from bench.datasets import photographs
-from bench.suite import Suite, grid
+from bench.images import photographs
+from bench.runner.suite import Suite, grid
 from defenses.affine import Affine
 from defenses.ldp import LDP
 from defenses.none import Undefended

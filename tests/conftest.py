@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench import cache
+from bench.cache import store
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 
@@ -15,7 +15,7 @@ SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 def _cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """What tests keep is theirs alone, and goes with them."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv(cache.VARIABLE, str(tmp_path_factory.mktemp("cache")))
+        patch.setenv(store.VARIABLE, str(tmp_path_factory.mktemp("cache")))
         yield
 
 

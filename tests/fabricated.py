@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from bench.records import FILE, SCHEMA, cell_id, run_hash
+from bench.runner.records import FILE, SCHEMA, cell_id, run_hash
 
 SIFT = {"name": "sift", "upright": True, "max_keypoints": 1000}
 ENVIRONMENT = {"version": "0.1.0", "source": "sha256:" + "5" * 64, "torch": "2.14", "device": "cpu", "threads": 2}

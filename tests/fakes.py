@@ -9,10 +9,10 @@ import pytest
 from PIL import Image, ImageFilter
 from scipy.spatial.transform import Rotation
 
-from bench.datasets.scene import File, Reference, Scene, SceneImage
-from bench.features.sift import Sift
-from bench.plugin import Defense, Trial
-from bench.public import Public
+from bench.api import Defense, Trial
+from bench.codebook.public import Public
+from bench.extractors.sift import Sift
+from bench.images.scene import File, Reference, Scene, SceneImage
 from bench.testing import NO_UNIT, shot
 from bench.types import Features, Release
 

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from bench.kernels.search import BLOCK, unit_rows
+from bench.geometry.nearest_words import BLOCK, unit_rows
 
 
 def bare_product(rows: int, words: np.ndarray, dtype: torch.dtype) -> Callable[[], None]:

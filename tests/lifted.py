@@ -5,12 +5,12 @@ from typing import Any
 
 import numpy as np
 
-from bench.datasets import photographs
-from bench.features import dictionary
-from bench.features.sift import Sift
-from bench.kernels.search import unit_rows
-from bench.plugin import Asset, View
-from bench.public import Public
+from bench.api import Asset, View
+from bench.codebook import dictionary
+from bench.codebook.public import Public
+from bench.extractors.sift import Sift
+from bench.geometry.nearest_words import unit_rows
+from bench.images import photographs
 from bench.types import Features, Subspaces
 from defenses.affine import Affine
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from bench.errors import UnitError, UserError
-from bench.features import dictionary
-from bench.kernels.search import unit_rows
-from bench.plugin import Asset, Privacy
-from bench.public import Public
+from bench.api import Asset, Privacy
+from bench.codebook import dictionary
+from bench.codebook.public import Public
+from bench.core.errors import UnitError, UserError
+from bench.geometry.nearest_words import unit_rows
 from bench.testing import same
 from bench.types import Features
 from defenses.affine import PLUGIN as AFFINE

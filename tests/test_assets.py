@@ -6,13 +6,13 @@ import pytest
 
 import bench
 from attacks.dia import DIA
-from attacks.inversion import weights
-from attacks.inversion.painting import painted
-from attacks.inversion.symmetry import symmetries
-from attacks.inversion.train import check_quantisation
-from bench.datasets import photographs
-from bench.features.sift import Sift
-from bench.public import ASSETS, Public
+from bench.codebook.public import ASSETS, Public
+from bench.extractors.sift import Sift
+from bench.images import photographs
+from bench.inversion import weights
+from bench.inversion.reconstruct import painted
+from bench.inversion.symmetry import symmetries
+from bench.inversion.train import check_quantisation
 from defenses.affine import Affine
 from defenses.ldp import LDP
 from defenses.none import Undefended

@@ -15,15 +15,15 @@ from fakes import install
 from scipy import stats
 
 from bench import cli
+from bench.api import Asset, Defense, Privacy
 from bench.audit.auditor import Audit, audit, near_words
 from bench.audit.bounds import log_ratio, more_alike_than_independent
 from bench.audit.findings import CONFIDENCE
-from bench.errors import UserError
-from bench.exact import Exact
-from bench.kernels.search import unit_rows
-from bench.kernels.subset import draw_distinct, word_subsets
-from bench.plugin import Asset, Defense, Privacy
-from bench.public import Public
+from bench.codebook.public import Public
+from bench.core.errors import UserError
+from bench.core.exact import Exact
+from bench.geometry.nearest_words import unit_rows
+from bench.mechanisms.subset import draw_distinct, word_subsets
 from bench.types import Descriptors, Features, Indices, WordSets
 from defenses.ldp import LDP
 from defenses.naive_ldp import NaiveLDP

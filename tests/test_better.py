@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from bench import registry, spec
-from leaderboard.reproduce.intervals import Interval
+from bench.registry import discovery, spec
+from leaderboard.intervals import Interval
 
 
 @pytest.fixture(autouse=True)
@@ -20,7 +20,7 @@ def test_each_row_is_served_by_the_network_of_its_defense() -> None:
     assert len({text for _, _, text in rows}) == len(rows)
     assert {name.partition(":")[0] for _, name, _ in rows} == better.SERVED.keys()
     for _, name, text in rows:
-        defense = spec.read(text, registry.DEFENSE)
+        defense = spec.read(text, discovery.DEFENSE)
         for field, setting in better.SERVED[name.partition(":")[0]].items():
             assert getattr(defense, field) in setting
     bases = [epsilon for epsilon, name, _ in rows if name == better.BASE]

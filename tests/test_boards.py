@@ -7,9 +7,9 @@ import fabricated
 import pytest
 from fabricated import DIA, ENVIRONMENT, GALLERY, PHOTOGRAPHS, SETTINGS, inapplicable, ldp, localizations, reconstructions
 
-from bench.errors import UserError
-from leaderboard import boards, sheets
-from leaderboard.boards import Board
+from bench.core.errors import UserError
+from leaderboard import comparison, group_tables
+from leaderboard.comparison import Board
 from leaderboard.measures import measures
 from leaderboard.ranking import Standing, standings
 
@@ -18,7 +18,7 @@ NEAREST = {"name": "nearest"}
 
 
 def made(tmp_path: Path, *groups: list[dict[str, Any]]) -> list[Board]:
-    return boards.boards(boards.find(fabricated.write(tmp_path, [record for group in groups for record in group])))
+    return comparison.boards(comparison.find(fabricated.write(tmp_path, [record for group in groups for record in group])))
 
 
 def by_defense(board: Board) -> dict[str, Standing]:
@@ -90,19 +90,19 @@ def test_a_unit_that_one_seed_lacks_is_not_averaged(tmp_path: Path) -> None:
 def test_records_of_many_folders_are_found_and_the_latest_counts(tmp_path: Path) -> None:
     fabricated.write(tmp_path / "b" / "deep", reconstructions(NONE, [0.8]))
     fabricated.write(tmp_path / "a", reconstructions(NONE, [0.1]))
-    (found,) = boards.find(tmp_path)
+    (found,) = comparison.find(tmp_path)
     assert found.record["metrics"]["ssim"] == 0.8
     assert found.folder == tmp_path / "b" / "deep"
 
 
 def test_no_record_is_a_mistake(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"there is no record in it \(looked for files called records.jsonl\)"):
-        boards.find(tmp_path)
+        comparison.find(tmp_path)
     with pytest.raises(UserError, match="absent: no such file"):
-        boards.find(tmp_path / "absent")
+        comparison.find(tmp_path / "absent")
     (tmp_path / "records.jsonl").write_text("{}\n")
     with pytest.raises(UserError, match=r"records.jsonl, line 1: not a record"):
-        boards.find(tmp_path)
+        comparison.find(tmp_path)
 
 
 # ---- ranking
@@ -121,7 +121,7 @@ def test_a_defense_is_judged_by_the_strongest_attack(tmp_path: Path) -> None:
     assert [(one.rank, one.defense) for one in ranked] == [(1, "ldp:epsilon=8,subset_size=2"), (2, "affine:dim=4"), (3, "none")]
     assert ranked[1].strongest is not None
     assert ranked[1].strongest.attack == "nearest"  # by dia alone affine would be first
-    shown = sheets.ranking(board).rows
+    shown = group_tables.ranking(board).rows
     assert [row.values["attack"] for row in shown] == ["dia", "nearest", "dia"]
 
 
@@ -144,7 +144,7 @@ def test_without_an_adapted_attacker_a_defense_is_unranked_and_last(tmp_path: Pa
         (None, reason),
         (None, "no adapted attacker was run (dia)"),
     ]
-    rows = sheets.ranking(board).rows
+    rows = group_tables.ranking(board).rows
     assert [row.values["rank"] for row in rows] == [1, None, None]
     assert f"unranked: {reason}" in rows[1].note
 
@@ -165,7 +165,7 @@ def test_the_mean_of_what_was_left_over_ranks_nobody(tmp_path: Path, attack: dic
     standing = next(one for name, one in found.items() if name.startswith("ldp"))
     assert standing.rank is None
     assert "has done 1 of 2" in str(standing.unranked)
-    notes = [row.note for row in sheets.pairs(board).rows]
+    notes = [row.note for row in group_tables.pairs(board).rows]
     assert any("1 failed: 1.png: too dark" in note for note in notes)
 
 
@@ -185,7 +185,7 @@ def test_recall_is_told_by_day_and_by_night_with_wilsons_interval(tmp_path: Path
     (board,) = made(tmp_path, localizations(NONE, hits, ["day"] * 4 + ["night"] * 3))
     assert board.conditions == ("day", "night")
     assert not board.attacked
-    (row,) = sheets.pairs(board).rows
+    (row,) = group_tables.pairs(board).rows
     for condition, (successes, trials) in {"day": (3, 4), "night": (1, 3)}.items():
         value = row.values[f"recall_0.25m_2deg_{condition}"]
         expected = binomtest(successes, trials).proportion_ci(0.95, method="wilson")
@@ -199,12 +199,12 @@ def test_older_records_without_a_condition_are_one_group(tmp_path: Path) -> None
         del record["condition"]
     (board,) = made(tmp_path, records)
     assert board.conditions == (None,)
-    assert "recall_0.25m_2deg" in sheets.pairs(board).rows[0].values
+    assert "recall_0.25m_2deg" in group_tables.pairs(board).rows[0].values
 
 
 def test_a_query_that_was_not_localized_counts_in_the_median(tmp_path: Path) -> None:
     (board,) = made(tmp_path, localizations(NONE, [1, 0, 0], ["day"] * 3), localizations(ldp(8.0), [1, 1, 0], ["day"] * 3))
-    errors = {row.values["defense"]: row.values["translation_error_day"].mean for row in sheets.pairs(board).rows}  # type: ignore[union-attr]
+    errors = {row.values["defense"]: row.values["translation_error_day"].mean for row in group_tables.pairs(board).rows}  # type: ignore[union-attr]
     assert errors == {"none": float("inf"), "ldp:epsilon=8,subset_size=2": 0.1}
 
 

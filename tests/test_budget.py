@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from bench import cli
-from bench.budget import budget, nearest, yields
-from bench.composition import basic, optimal
-from bench.errors import UserError
-from bench.kernels.subset import word_subsets
+from bench.core.errors import UserError
+from bench.mechanisms.budget import budget, nearest, yields
+from bench.mechanisms.composition import basic, optimal
+from bench.mechanisms.subset import word_subsets
 
 
 def test_what_is_left_costs_what_was_asked() -> None:

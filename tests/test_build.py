@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
-from bench import tensorfile
 from bench.cli import main
-from bench.datasets import photographs
-from bench.errors import UserError
-from bench.features import build, dictionary
-from bench.features.sift import Sift
-from bench.kernels.search import unit_rows
+from bench.codebook import build, dictionary
+from bench.core.errors import UserError
+from bench.extractors.sift import Sift
+from bench.formats import tensor_file
+from bench.geometry.nearest_words import unit_rows
+from bench.images import photographs
 
 
 @pytest.fixture(scope="module")
@@ -117,6 +117,6 @@ def test_files_that_are_none(content, message, tmp_path):
 )
 def test_content_that_is_none(words, kind, message, tmp_path):
     path = tmp_path / "K.safetensors"
-    tensorfile.save(path, kind, {"words": words}, {"photographs": []})
+    tensor_file.save(path, kind, {"words": words}, {"photographs": []})
     with pytest.raises(UserError, match=message):
         dictionary.load(path)

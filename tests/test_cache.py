@@ -16,17 +16,20 @@ from fake_plugins.guess import Guess
 from fake_plugins.painter import Painter
 from fakes import FAKES, album, install
 
-from attacks.inversion import kept as networks
-from attacks.inversion import weights
-from attacks.inversion.plan import Plan, Training
 from attacks.sparsity import Sparsity
-from bench import cache, cli, provenance, recovery, runner, tensorfile
-from bench.datasets.photographs import folder
-from bench.features.sift import Sift
-from bench.kernels.search import WordIndex
-from bench.plugin import Asset
-from bench.public import ASSETS
-from bench.records import Record
+from bench import cli
+from bench.api import Asset
+from bench.cache import attack_cache, provenance, store
+from bench.codebook.public import ASSETS
+from bench.extractors.sift import Sift
+from bench.formats import tensor_file
+from bench.geometry.nearest_words import WordIndex
+from bench.images.photographs import folder
+from bench.inversion import network_cache as networks
+from bench.inversion import weights
+from bench.inversion.plan import Plan, Training
+from bench.runner import plan as runner
+from bench.runner.records import Record
 from bench.tasks.reconstruction import Reconstruction
 from bench.testing import small_dictionary
 from defenses.affine import Affine
@@ -39,8 +42,8 @@ PAINT = Reconstruction(inverter="painter")
 @pytest.fixture(autouse=True)
 def kept_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     install(tmp_path / "installed", monkeypatch, FAKES)
-    monkeypatch.setenv(cache.VARIABLE, str(tmp_path / "cache"))
-    monkeypatch.setattr(recovery, "WORTH", 0.0)
+    monkeypatch.setenv(store.VARIABLE, str(tmp_path / "cache"))
+    monkeypatch.setattr(attack_cache, "WORTH", 0.0)
     return tmp_path / "cache"
 
 
@@ -69,7 +72,7 @@ def guessed(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return calls
 
 
-def numbers() -> cache.Made:
+def numbers() -> store.Made:
     return {"numbers": np.arange(1000)}, {"of": "numbers"}
 
 
@@ -120,8 +123,8 @@ def test_what_is_found_again_is_what_would_have_been_made(
     defense = Affine(lifting="random")
     kept_once = [run(defense, attack, images) for attack in (Guess(), Sparsity(pivots=2)) for _ in range(2)]
     with monkeypatch.context() as without:
-        without.setattr(recovery, "WORTH", np.inf)
-        without.setenv(cache.VARIABLE, str(kept_in / "none"))
+        without.setattr(attack_cache, "WORTH", np.inf)
+        without.setenv(store.VARIABLE, str(kept_in / "none"))
         made = [run(defense, attack, images) for attack in (Guess(), Sparsity(pivots=2)) for _ in range(2)]
     assert list(map(judged, kept_once)) == list(map(judged, made))
     assert not list((kept_in / "none").glob("recovered/*"))
@@ -160,25 +163,25 @@ def test_seconds_are_those_of_the_attack_though_it_was_spared(
 
 
 def test_what_was_quick_is_not_kept(images: Path, small: Asset, kept_in: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recovery, "WORTH", np.inf)
+    monkeypatch.setattr(attack_cache, "WORTH", np.inf)
     run(LDP(dictionary=small), Guess(), images)
-    assert {entry.kind for entry in cache.entries()} == {"words"}
+    assert {entry.kind for entry in store.entries()} == {"words"}
 
 
 def test_what_is_kept_is_what_is_used(images: Path, small: Asset) -> None:
     """A control: were something else kept, records would show it."""
     first = run(LDP(dictionary=small), Guess(), images)
-    for entry in cache.entries():
+    for entry in store.entries():
         if entry.kind == "recovered":
             overwrite_with_one_direction(entry.path)
     assert run(LDP(dictionary=small), Guess(), images)[0]["metrics"]["angle"] != first[0]["metrics"]["angle"]
 
 
 def overwrite_with_one_direction(file: Path) -> None:
-    arrays, meta, _ = tensorfile.load(file, "recovered")
+    arrays, meta, _ = tensor_file.load(file, "recovered")
     direction = np.zeros_like(arrays["descriptors"])
     direction[:, 0] = 1
-    tensorfile.save(file, "recovered", arrays | {"descriptors": direction}, meta)
+    tensor_file.save(file, "recovered", arrays | {"descriptors": direction}, meta)
 
 
 # ---- words, networks
@@ -195,19 +198,19 @@ def test_words_are_searched_once_for_all_settings(images: Path, small: Asset, mo
     monkeypatch.setattr(WordIndex, "nearest", counted)
     first = [run(LDP(epsilon=epsilon, dictionary=small), Painter(), images) for epsilon in (4, 8)]
     assert len(searched) == 3  # two photographs, and the keypoint of the rehearsal
-    with cache.within(cache.root() / "elsewhere"):
+    with store.within(store.root() / "elsewhere"):
         again = [run(LDP(epsilon=epsilon, dictionary=small), Painter(), images) for epsilon in (4, 8)]
     assert len(searched) == 6
     assert list(map(judged, first)) == list(map(judged, again))
 
 
 def test_protecting_for_real_leaves_no_trace(images: Path, small: Asset) -> None:
-    from bench.datasets import photographs
-    from bench.protection import protect
+    from bench.images import photographs
+    from bench.mechanisms.protection import protect
 
     features = Sift().extract(photographs.read(images / "0.png").pixels)
     protect(features, LDP(dictionary=small))
-    assert not list(cache.entries())
+    assert not list(store.entries())
 
 
 def test_network_is_found_again_by_what_made_it(images: Path, tmp_path: Path) -> None:
@@ -281,20 +284,20 @@ def test_source_of_an_attack_has_its_kernels_and_no_metric_or_command() -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(provenance, "_text", listed)
         provenance.source("attacks.clustering")
-    assert {"bench.kernels.sharing", "bench.kernels.subspaces", "bench.types"} <= set(found)
-    assert not [name for name in found if name.startswith(("metrics", "bench.commands", "leaderboard", "bench.runner"))]
+    assert {"bench.geometry.shared_sub_database", "bench.geometry.subspaces", "bench.types"} <= set(found)
+    assert not [name for name in found if name.startswith(("metrics", "bench.cli", "leaderboard", "bench.runner.plan"))]
 
 
 # ---- files
 
 
 def test_damaged_entries_are_named_and_made_again(kept_in: Path, caplog: pytest.LogCaptureFixture) -> None:
-    first, _ = cache.fetch("a", 1, numbers)
-    (entry,) = cache.entries()
+    first, _ = store.fetch("a", 1, numbers)
+    (entry,) = store.entries()
     assert entry.fault() is None
     entry.path.write_bytes(entry.path.read_bytes()[:-1] + b"\x07")
     assert "checksum" in str(entry.fault())
-    again, _ = cache.fetch("a", 1, numbers)
+    again, _ = store.fetch("a", 1, numbers)
     np.testing.assert_array_equal(again["numbers"], first["numbers"])
     assert "checksum" in caplog.text
     assert "made again" in caplog.text
@@ -309,15 +312,15 @@ def test_folders_are_kept_with_checksums(kept_in: Path) -> None:
         (place / "a.txt").write_text("a")
         (place / "b.txt").write_text("b")
 
-    place = cache.folder("models", "key", fill)
-    assert cache.folder("models", "key", fill) == place
+    place = store.folder("models", "key", fill)
+    assert store.folder("models", "key", fill) == place
     assert len(made) == 1
-    told = subprocess.run(["sha256sum", "-c", cache.SUMS], cwd=place, capture_output=True, text=True, check=True).stdout
+    told = subprocess.run(["sha256sum", "-c", store.SUMS], cwd=place, capture_output=True, text=True, check=True).stdout
     assert told == "a.txt: OK\nb.txt: OK\n"
     (place / "b.txt").write_text("c")
-    (entry,) = cache.entries()
+    (entry,) = store.entries()
     assert "checksum of b.txt" in str(entry.fault())
-    assert (cache.folder("models", "key", fill) / "b.txt").read_text() == "b"
+    assert (store.folder("models", "key", fill) / "b.txt").read_text() == "b"
     assert len(made) == 2
 
     def broken(place: Path) -> None:
@@ -325,17 +328,17 @@ def test_folders_are_kept_with_checksums(kept_in: Path) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        cache.folder("models", "other", broken)
-    assert [entry.path for entry in cache.entries()] == [place]
+        store.folder("models", "other", broken)
+    assert [entry.path for entry in store.entries()] == [place]
 
 
 def test_full_disk_keeps_nothing_and_loses_nothing(kept_in: Path, caplog: pytest.LogCaptureFixture) -> None:
-    cache.fetch("a", "before", numbers)
+    store.fetch("a", "before", numbers)
     with small_disk(100):
-        arrays, _ = cache.fetch("a", "full", numbers)
+        arrays, _ = store.fetch("a", "full", numbers)
     np.testing.assert_array_equal(arrays["numbers"], np.arange(1000))
     assert "it is not kept" in caplog.text
-    (entry,) = cache.entries()  # nothing half-written is left
+    (entry,) = store.entries()  # nothing half-written is left
     assert entry.fault() is None
 
 
@@ -354,12 +357,12 @@ def test_disk_that_fills_up_in_a_run_is_told_and_nothing_else_is_lost(images: Pa
 @pytest.fixture
 def three(kept_in: Path) -> dict[str, Path]:
     """Entries of two kinds, one of them old and one large."""
-    cache.fetch("a", "new", numbers)
-    cache.fetch("a", "old", numbers)
-    cache.fetch("b", "large", lambda: ({"numbers": np.arange(10_000)}, {}))
+    store.fetch("a", "new", numbers)
+    store.fetch("a", "old", numbers)
+    store.fetch("b", "large", lambda: ({"numbers": np.arange(10_000)}, {}))
     ago = time.time() - 40 * 24 * 3600
-    os.utime(cache.path("a", "old"), (ago, ago))
-    return {"new": cache.path("a", "new"), "old": cache.path("a", "old"), "large": cache.path("b", "large")}
+    os.utime(store.path("a", "old"), (ago, ago))
+    return {"new": store.path("a", "new"), "old": store.path("a", "old"), "large": store.path("b", "large")}
 
 
 def test_list_and_verify(three: dict[str, Path], capfd: pytest.CaptureFixture[str]) -> None:
@@ -408,7 +411,7 @@ def test_prune(three: dict[str, Path], options: tuple[Any, ...], left: set[str],
 
 
 def test_use_makes_young(three: dict[str, Path], capfd: pytest.CaptureFixture[str]) -> None:
-    cache.fetch("a", "old", numbers)
+    store.fetch("a", "old", numbers)
     bench(capfd, "cache", "prune", "--older-than", 30)
     assert three["old"].is_file()
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from bench.kernels.candidates import most_genuine, recurring, ties, zeros
-from bench.kernels.search import unit_rows
+from bench.geometry.candidates import most_genuine, recurring, ties, zeros
+from bench.geometry.nearest_words import unit_rows
 
 PLAIN = [9, 1, 2, 3, 4, 5]
 SPARSE = [9, 1, 2, 3, 0, 0]

@@ -10,12 +10,12 @@ from fakes import album
 from PIL import Image
 from scipy.spatial.distance import pdist
 
-from bench import cache
+from bench.cache import store
+from bench.core.errors import UserError
 from bench.datasets import captured
 from bench.datasets.captured import Captured
 from bench.datasets.gallery import Gallery
-from bench.datasets.scene import SceneImage
-from bench.errors import UserError
+from bench.images.scene import SceneImage
 
 WALK = Gallery(views=150, rooms=1, people=0.0, width=400, height=300, detail=0.5)
 FIRST, COUNT = 84, 9
@@ -108,10 +108,10 @@ def test_unit_must_be_fixed_by_two_photographs_that_have_a_place(dataset: Captur
 
 
 def test_photographs_of_nothing_in_common(tmp_path: Path) -> None:
-    before = [entry for entry in cache.entries() if entry.kind == "models"]
+    before = [entry for entry in store.entries() if entry.kind == "models"]
     with pytest.raises(UserError, match="structure from motion found no model; do the photographs overlap"):
         Captured(path=album(tmp_path / "noise", 3)).scene()
-    assert [entry for entry in cache.entries() if entry.kind == "models"] == before
+    assert [entry for entry in store.entries() if entry.kind == "models"] == before
 
 
 @pytest.mark.parametrize("fields", [{"held_out": 1}, {"leading": -1}, {"length": 0.0}, {"length": float("nan")}])

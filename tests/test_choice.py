@@ -11,9 +11,9 @@ import pytest
 from scipy import stats
 
 from bench import cli
-from bench.choice import SAMPLE, Service, choices, drawn, kept, measured, success
-from bench.errors import UserError
-from bench.kernels.subset import most_informative_size, word_subsets
+from bench.core.errors import UserError
+from bench.mechanisms.subset import most_informative_size, word_subsets
+from bench.mechanisms.subset_size import SAMPLE, Service, choices, drawn, kept, measured, success
 
 
 def test_matches_against_enumeration() -> None:

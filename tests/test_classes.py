@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from bench.kernels.classes import chances, draw_classes, edges, exponentials
-from bench.kernels.subset import chance_digits
+from bench.mechanisms.classes import chances, draw_classes, edges, exponentials
+from bench.mechanisms.subset import chance_digits
 
 ALPHA, CERTAINLY_WRONG = 1e-4, 1e-9
 

@@ -14,11 +14,13 @@ import pytest
 from fake_plugins.painter import Painter
 from fakes import FAKES, album, install
 
-from bench import cli, registry, terminal
+from bench import cli
+from bench.api import View
+from bench.cli import terminal
 from bench.datasets import colmap
 from bench.datasets.gallery import Gallery
-from bench.plugin import View
-from bench.records import Log
+from bench.registry import discovery
+from bench.runner.records import Log
 from bench.testing import small_dictionary
 
 Bench = Callable[..., tuple[int, str, str]]
@@ -235,7 +237,7 @@ def test_main_job_on_one_photograph(bench: Bench, images: Path) -> None:
         pytest.skip("the networks are not here")
     assert status == 0
     assert "ldp:epsilon=10,subset_size=2" in shown
-    assert registry.lookup(registry.ATTACK, "dia").name() in shown
+    assert discovery.lookup(discovery.ATTACK, "dia").name() in shown
 
 
 def test_nothing_is_asked_of_the_terminal_when_there_is_none(tmp_path: Path) -> None:

@@ -8,9 +8,9 @@ from fakes import trial
 
 from attacks.clustering import Clustering, clustered
 from attacks.intersection import Intersection
-from bench.features import dictionary
-from bench.plugin import Asset, DescriptorAttack
-from bench.public import Public
+from bench.api import Asset, DescriptorAttack
+from bench.codebook import dictionary
+from bench.codebook.public import Public
 from bench.tasks.reconstruction import view
 from bench.testing import example_features, small_dictionary
 from bench.types import Features, Subspaces

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from fakes import trial
 
-from bench.errors import UserError
-from bench.features.sift import Sift
-from bench.kernels.search import unit_rows
-from bench.kernels.sharing import company, nearest_that_meet, stacked
-from bench.plugin import Asset
-from bench.public import Public
+from bench.api import Asset
+from bench.codebook.public import Public
+from bench.core.errors import UserError
+from bench.extractors.sift import Sift
+from bench.geometry.nearest_words import unit_rows
+from bench.geometry.shared_sub_database import company, nearest_that_meet, stacked
 from bench.tasks.collisions import Collisions, no_collision
 from bench.testing import example_features, small_dictionary
 from bench.types import Features, Subspaces

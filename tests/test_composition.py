@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bench.composition import DELTA, basic, epsilon_left, optimal, together
+from bench.mechanisms.composition import DELTA, basic, epsilon_left, optimal, together
 
 
 def least_epsilon(epsilon: float, answers: int, delta: float) -> float:

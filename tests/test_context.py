@@ -10,20 +10,20 @@ import torch
 import torch.nn.functional as nnf
 
 from attacks.context import Context
-from attacks.inversion.plan import Training
-from attacks.inversion.train import check_quantisation
-from attacks.surroundings import weights
-from attacks.surroundings.network import Shape, Surroundings, propagate, shares
-from attacks.surroundings.scenes import CERTAIN, log_odds, nearest_keypoints, scene
-from attacks.surroundings.train import Lesson, fit, lesson, lessons, validate
-from bench.datasets import photographs
-from bench.errors import UserError
-from bench.features.sift import Sift
-from bench.features.views import PhotographView
-from bench.kernels.search import unit_rows
-from bench.kernels.subset import log10_chance, word_subsets
-from bench.plugin import View
-from bench.public import ASSETS, Public
+from bench.api import View
+from bench.codebook.public import ASSETS, Public
+from bench.context import weights
+from bench.context.encoding import CERTAIN, log_odds, nearest_keypoints, scene
+from bench.context.network import Shape, Surroundings, propagate, shares
+from bench.context.train import Lesson, fit, lesson, lessons, validate
+from bench.core.errors import UserError
+from bench.extractors.sift import Sift
+from bench.geometry.nearest_words import unit_rows
+from bench.images import photographs
+from bench.images.views import PhotographView
+from bench.inversion.plan import Training
+from bench.inversion.train import check_quantisation
+from bench.mechanisms.subset import log10_chance, word_subsets
 from bench.testing import example_features, small_dictionary
 from bench.types import Knowledge, WordSets
 from defenses.ldp import LDP

@@ -8,14 +8,16 @@ import numpy as np
 import pytest
 from fakes import texture
 
-from bench import cache, fields, registry, spec, tensorfile
-from bench.datasets import photographs
-from bench.features import dictionary
-from bench.features.sift import Sift
-from bench.kernels.search import unit_rows
-from bench.plugin import Attack, Defense, Extractor, Metric, Privacy, View
-from bench.public import Public
-from bench.registry import Kind
+from bench.api import Attack, Defense, Extractor, Metric, Privacy, View
+from bench.cache import store
+from bench.codebook import dictionary
+from bench.codebook.public import Public
+from bench.extractors.sift import Sift
+from bench.formats import tensor_file
+from bench.geometry.nearest_words import unit_rows
+from bench.images import photographs
+from bench.registry import discovery, fields, spec
+from bench.registry.discovery import Kind
 from bench.testing import (
     check_applicability,
     check_attack,
@@ -30,7 +32,7 @@ from defenses.ldp import LDP
 
 
 def plugins(kind: Kind) -> Any:
-    return pytest.mark.parametrize("plugin", registry.everything(kind), ids=lambda plugin: plugin.name())
+    return pytest.mark.parametrize("plugin", discovery.everything(kind), ids=lambda plugin: plugin.name())
 
 
 def built(plugin: type) -> Any:
@@ -39,7 +41,7 @@ def built(plugin: type) -> Any:
     return spec.build(plugin, {})
 
 
-@plugins(registry.DEFENSE)
+@plugins(discovery.DEFENSE)
 def test_defense(plugin: type[Defense], tmp_path: Path) -> None:
     defense = built(plugin)
     small = small_dictionary(tmp_path)
@@ -48,20 +50,20 @@ def test_defense(plugin: type[Defense], tmp_path: Path) -> None:
     )
 
 
-@plugins(registry.METRIC)
+@plugins(discovery.METRIC)
 def test_metric(plugin: type[Metric]) -> None:
     check_metric(built(plugin))
 
 
-@plugins(registry.EXTRACTOR)
+@plugins(discovery.EXTRACTOR)
 def test_extractor(plugin: type[Extractor], tmp_path: Path) -> None:
     check_extractor(built(plugin), photographs.square(texture(0), 256))
 
 
 PAIRS = [
     pytest.param(attack, defense, id=f"{attack.name()}-{defense.name()}")
-    for attack in registry.everything(registry.ATTACK)
-    for defense in registry.everything(registry.DEFENSE)
+    for attack in discovery.everything(discovery.ATTACK)
+    for defense in discovery.everything(discovery.DEFENSE)
 ]
 
 
@@ -140,13 +142,13 @@ def test_attack_that_rummages_in_what_is_kept_on_disk_is_noticed(tmp_path: Path)
 
     class Rummaging(Guess):
         def recover(self, view: View, rng: np.random.Generator) -> np.ndarray:
-            (features,) = (entry.path for entry in cache.entries() if entry.kind == "features")
-            return unit_rows(tensorfile.load(features, "features")[0]["descriptors"] + np.float32(1e-3))
+            (features,) = (entry.path for entry in store.entries() if entry.kind == "features")
+            return unit_rows(tensor_file.load(features, "features")[0]["descriptors"] + np.float32(1e-3))
 
     class Quantised(Guess):
         def recover(self, view: View, rng: np.random.Generator) -> np.ndarray:
-            (words,) = (entry.path for entry in cache.entries() if entry.kind == "words")
-            found = tensorfile.load(words, "words")[0]["words"]
+            (words,) = (entry.path for entry in store.entries() if entry.kind == "words")
+            found = tensor_file.load(words, "words")[0]["words"]
             return unit_rows(dictionary.load(Path(small)).words[found])
 
     small = small_dictionary(tmp_path)

@@ -7,13 +7,13 @@ import pytest
 from scipy import stats
 
 from attacks.database import Database
-from bench.errors import UserError
-from bench.features.dictionary import Dictionary
-from bench.features.sift import Sift
-from bench.kernels.search import unit_rows
-from bench.kernels.subspaces import nearest_to_subspaces
-from bench.plugin import Defense, Privacy, View
-from bench.public import Public
+from bench.api import Defense, Privacy, View
+from bench.codebook.dictionary import Dictionary
+from bench.codebook.public import Public
+from bench.core.errors import UserError
+from bench.extractors.sift import Sift
+from bench.geometry.nearest_words import unit_rows
+from bench.geometry.subspaces import nearest_to_subspaces
 from bench.types import Features, Knowledge, Subspaces
 from defenses.affine import Affine, lift, reparameterise
 

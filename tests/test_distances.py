@@ -5,8 +5,8 @@ import pytest
 import torch
 from scipy.linalg import lstsq
 
-from bench.kernels.distances import mutual, points_to_points, subspaces_to_points, subspaces_to_subspaces
-from bench.kernels.search import unit_rows
+from bench.geometry.distances import mutual, points_to_points, subspaces_to_points, subspaces_to_subspaces
+from bench.geometry.nearest_words import unit_rows
 from bench.testing import example_features
 from bench.types import Floats, Subspaces
 

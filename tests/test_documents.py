@@ -10,8 +10,9 @@ from pathlib import Path
 import pytest
 from fakes import album
 
-from bench import cli, skeleton
+from bench import cli
 from bench.cli import parser
+from bench.registry import scaffold
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = {name: ROOT / f"{name}.md" for name in ("README", "docs/method", "docs/formats", "docs/extending", "docs/scale")}
@@ -108,7 +109,7 @@ def test_what_is_said_of_commands_is_of_commands_that_are_there() -> None:
 
 
 def test_all_kinds_of_plugins_are_shown() -> None:
-    assert {command.split()[1] for command in commands("docs/extending") if command.startswith("new ")} == set(skeleton.KINDS)
+    assert {command.split()[1] for command in commands("docs/extending") if command.startswith("new ")} == set(scaffold.KINDS)
 
 
 def test_targets_of_make_are_there() -> None:

@@ -13,14 +13,14 @@ from fakes import album, texture
 from PIL import Image
 
 from bench import cli
-from bench.datasets import photographs
-from bench.errors import UnitError, UserError
-from bench.features import handed_out
-from bench.features.colmap_database import ColmapDatabase
-from bench.features.hardnet import WEIGHTS, HardNet
-from bench.features.hloc import Hloc
-from bench.features.sift import Sift
-from bench.features.stored import in_square, out_of_square
+from bench.core.errors import UnitError, UserError
+from bench.extractors.colmap_database import ColmapDatabase
+from bench.extractors.hardnet import WEIGHTS, HardNet
+from bench.extractors.hloc import Hloc
+from bench.extractors.sift import Sift
+from bench.formats.stored_features import in_square, out_of_square
+from bench.images import photographs
+from bench.runner import feature_export
 from bench.testing import check_extractor, small_dictionary
 
 kornia = pytest.importorskip("kornia")
@@ -66,7 +66,7 @@ def test_features_for_hloc_are_those_that_come_back(images: Path, tmp_path: Path
         assert group["image_size"][()].tolist() == [300, 200]
         xy = group["keypoints"][()]  # of the photograph, the centre of the first pixel at (0, 0)
     np.testing.assert_allclose(xy, ours.keypoints * (200 / 256) + [50, 0] - 0.5, atol=1e-3)
-    assert handed_out.read_pairs(pairs) == [("b.png", "street/a.png")]
+    assert feature_export.read_pairs(pairs) == [("b.png", "street/a.png")]
 
 
 def test_of_a_set_each_word_is_written_and_of_a_subspace_what_is_recovered(
@@ -106,9 +106,9 @@ def test_mistakes_of_export(images: Path, tmp_path: Path, capfd: pytest.CaptureF
 def test_lists_of_pairs(tmp_path: Path) -> None:
     (tmp_path / "pairs.txt").write_text("a.png b.png\n\nc.png\n")
     with pytest.raises(UserError, match=r"pairs.txt:3: a pair has two names, but there are 1"):
-        handed_out.read_pairs(tmp_path / "pairs.txt")
+        feature_export.read_pairs(tmp_path / "pairs.txt")
     with pytest.raises(UserError, match="space"):
-        handed_out.write_pairs(tmp_path / "new.txt", ["a b.png", "c.png"])
+        feature_export.write_pairs(tmp_path / "new.txt", ["a b.png", "c.png"])
 
 
 # ---- COLMAP
@@ -265,7 +265,7 @@ def without(monkeypatch: pytest.MonkeyPatch, package: str) -> None:
 
 def test_training_tells_tensorboard(tmp_path: Path) -> None:
     events = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
-    from attacks.inversion.log import Log
+    from bench.inversion.log import Log
 
     log = Log(tmp_path / "log")
     for step in range(1, 4):

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bench.exact import Exact, exact
+from bench.core.exact import Exact, exact
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from bench.audit.exhaustive import Law, NotEnumerableError, greatest_ratio, law
-from bench.kernels.subset import chance_digits, word_subsets
+from bench.mechanisms.subset import chance_digits, word_subsets
 
 EDGE = Fraction(1, 2**58)
 

@@ -13,10 +13,11 @@ from scipy.ndimage import binary_dilation
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
-from bench.datasets import gallery, photographs
+from bench.core.errors import UserError
+from bench.datasets import gallery
 from bench.datasets.gallery import Gallery, Shot, shot
-from bench.datasets.scene import Reference, Scene
-from bench.errors import UserError
+from bench.images import photographs
+from bench.images.scene import Reference, Scene
 from bench.rendering import walks
 from bench.rendering.furniture import furnish
 from bench.rendering.rooms import DOORS, ROOMS, walls

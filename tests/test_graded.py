@@ -17,20 +17,20 @@ from scipy import stats
 
 import bench
 from attacks import keypoints
-from bench import budget
+from bench.api import Defense
 from bench.audit.auditor import audit, near_words
-from bench.errors import UserError
-from bench.exact import Exact
-from bench.kernels.graded import graded_words
-from bench.kernels.neighbours import Neighbours
-from bench.kernels.search import unit_rows
-from bench.plugin import Defense
-from bench.public import ASSETS, Public
+from bench.codebook.public import ASSETS, Public
+from bench.core.errors import UserError
+from bench.core.exact import Exact
+from bench.geometry.nearest_words import unit_rows
+from bench.geometry.neighbours import Neighbours
+from bench.mechanisms import budget
+from bench.mechanisms.graded import graded_words
 from bench.testing import example_features, small_dictionary
 from bench.types import Features, WordSets
 from defenses.exponential import Exponential
 from defenses.metric_ldp import MetricLDP
-from leaderboard import boards, sheets, tables
+from leaderboard import comparison, group_tables, tables
 
 ALPHA = 1e-4
 
@@ -129,8 +129,8 @@ def test_it_never_stands_in_a_column_of_epsilons(tmp_path: Path) -> None:
     by_distance, by_epsilon = (row for _, row in tables.rendered(table).iterrows())
     assert (by_distance["ε/descriptor"], by_distance["ε/image"], by_epsilon["ε/descriptor"]) == ("n/a", "n/a", "10")
     assert by_distance["note"] == "another promise than ε-LDP: ε = 16 per unit of distance"
-    (board,) = boards.boards(boards.find(tmp_path / "run"))
-    rows = {row.cell.head["defense"]["name"]: row.values for row in sheets.pairs(board).rows}
+    (board,) = comparison.boards(comparison.find(tmp_path / "run"))
+    rows = {row.cell.head["defense"]["name"]: row.values for row in group_tables.pairs(board).rows}
     assert rows["metric-ldp"]["guarantee"] == "d_χ privacy, ε = 16 per unit of distance"
     assert rows["metric-ldp"]["epsilon_descriptor"] is None is rows["metric-ldp"]["epsilon_image"]
     assert rows["exponential"]["epsilon_descriptor"] == 10.0

@@ -11,10 +11,10 @@ import pytest
 import bench
 from bench import cli
 from bench.audit.bounds import log_ratio
-from bench.composition import epsilon_left
-from bench.features.dictionary import Dictionary
-from bench.kernels.subset import information, log10_chance, most_accurate_size, most_informative_size
-from bench.public import Public
+from bench.codebook.dictionary import Dictionary
+from bench.codebook.public import Public
+from bench.mechanisms.composition import epsilon_left
+from bench.mechanisms.subset import information, log10_chance, most_accurate_size, most_informative_size
 from bench.testing import example_features
 from defenses.ldp import LDP
 

@@ -11,11 +11,11 @@ from PIL import Image
 
 from attacks.lattice import Lattice
 from attacks.sparsity import Sparsity
-from bench.datasets import photographs
-from bench.errors import UnitError, UserError
-from bench.features.hloc import Hloc
-from bench.features.sift import Sift
-from bench.public import Public
+from bench.codebook.public import Public
+from bench.core.errors import UnitError, UserError
+from bench.extractors.hloc import Hloc
+from bench.extractors.sift import Sift
+from bench.images import photographs
 from bench.testing import check_extractor
 from defenses.affine import Affine
 

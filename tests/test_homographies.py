@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from fakes import texture
 
-from bench.datasets import homographies
-from bench.datasets.homographies import SIDE, hpatches, made
-from bench.errors import UserError
+from bench.core.errors import UserError
+from bench.rendering import homographies
+from bench.rendering.homographies import SIDE, hpatches, made
 
 SHIFT = np.array([[1, 0, 3.0], [0, 1, -2.0], [0, 0, 1]])
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from fakes import trial
 
-from bench.errors import UserError
-from bench.features.sift import Sift
-from bench.kernels.search import unit_rows
-from bench.public import Public
+from bench.codebook.public import Public
+from bench.core.errors import UserError
+from bench.extractors.sift import Sift
+from bench.geometry.nearest_words import unit_rows
 from bench.tasks.intersections import COUNTS, Intersections, matches, rounds, without
 from bench.testing import example_features, small_dictionary
 from defenses.affine import Affine

@@ -7,22 +7,22 @@ import pytest
 import torch
 from skimage.metrics import structural_similarity
 
-from attacks.inversion import data, weights
-from attacks.inversion.encoding import Points, condition, encode, stack
-from attacks.inversion.loss import reconstruction_loss, ssim
-from attacks.inversion.network import Inverter, Shape
-from attacks.inversion.painting import paint
-from attacks.inversion.plan import Plan, Training
-from attacks.inversion.train import check_quantisation, train
+from bench.api import Asset, Between, OneOf
 from bench.cli import main
-from bench.datasets import photographs
-from bench.datasets.photographs import Source
-from bench.errors import UserError
-from bench.features import build, dictionary
-from bench.features.sift import Sift
-from bench.features.views import OnDemand, collect
-from bench.plugin import Asset, Between, OneOf
-from bench.public import Public
+from bench.codebook import build, dictionary
+from bench.codebook.public import Public
+from bench.core.errors import UserError
+from bench.extractors.sift import Sift
+from bench.images import photographs
+from bench.images.photographs import Source
+from bench.images.views import OnDemand, collect
+from bench.inversion import data, weights
+from bench.inversion.encoding import Points, condition, encode, stack
+from bench.inversion.loss import reconstruction_loss, ssim
+from bench.inversion.network import Inverter, Shape
+from bench.inversion.plan import Plan, Training
+from bench.inversion.reconstruct import paint
+from bench.inversion.train import check_quantisation, train
 from bench.types import Descriptors, Subspaces, WordSets
 from defenses.affine import Affine, reparameterise
 from defenses.ldp import LDP
@@ -224,7 +224,7 @@ def of_two(sources, **given):
 
 @pytest.mark.parametrize("defense", [Undefended(), Affine(lifting="random", dim=2)])
 def test_a_resumed_training_is_the_same_training(defense, sources, tmp_path, monkeypatch):
-    import attacks.inversion.train as module
+    import bench.inversion.train as module
 
     monkeypatch.setattr(module, "CHECKPOINT_EVERY", 3)
     plan = of_two(sources, defense=defense, training=TINY)
@@ -253,7 +253,7 @@ def test_a_resumed_training_is_the_same_training(defense, sources, tmp_path, mon
 @pytest.mark.parametrize("defense", [Undefended(), LDP(epsilon=8, subset_size=2, words=2000)])
 def test_views_made_on_demand_train_the_same_network(defense, sources, tmp_path, monkeypatch):
     """What does not fit into memory is read again and again, and changes nothing."""
-    import attacks.inversion.train as module
+    import bench.inversion.train as module
 
     plan = of_two(sources, defense=defense, training=TINY, widths=(8, 8))
     kept = train(plan, tmp_path / "kept.safetensors")
@@ -309,7 +309,7 @@ def test_a_network_started_from_one_for_such_releases_is_that_one(shape):
 
 def test_training_learns(sources, tmp_path):
     """Forty steps on two photographs bring the loss well below that of the first."""
-    import attacks.inversion.train as module
+    import bench.inversion.train as module
 
     losses = []
 
@@ -327,7 +327,7 @@ def test_training_learns(sources, tmp_path):
 
 
 def test_a_checkpoint_of_another_training_is_refused(sources, tmp_path, monkeypatch):
-    import attacks.inversion.train as module
+    import bench.inversion.train as module
 
     plan, out = of_two(sources, training=TINY), tmp_path / "W.safetensors"
     monkeypatch.setattr(module.weights, "save", lambda *_: (_ for _ in ()).throw(OSError("the disk is full")))
@@ -446,12 +446,12 @@ def test_weights_keep_the_network(sources, tmp_path, rng):
     ],
 )
 def test_weights_that_do_not_fit(spoil, message, tmp_path):
-    from bench import tensorfile
+    from bench.formats import tensor_file
 
     shape, path = Shape(inputs=130), tmp_path / "W.safetensors"
     weights.save(path, Inverter(shape), shape, OF_RAW)
-    arrays, meta, _ = tensorfile.load(path, weights.KIND)
-    tensorfile.save(path, weights.KIND, spoil(arrays), meta)
+    arrays, meta, _ = tensor_file.load(path, weights.KIND)
+    tensor_file.save(path, weights.KIND, spoil(arrays), meta)
     with pytest.raises(UserError, match=message):
         weights.load(path)
 

@@ -6,20 +6,20 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from bench import registry, spec
-from bench.datasets import photographs
-from bench.features import dictionary
-from bench.features.sift import Sift
-from bench.plugin import Asset, Attack, DescriptorAttack, Trial
-from bench.population import Population
-from bench.public import Public
-from bench.randomness import randomness
+from bench.api import Asset, Attack, DescriptorAttack, Trial
+from bench.codebook import dictionary
+from bench.codebook.public import Public
+from bench.core.randomness import randomness
+from bench.extractors.sift import Sift
+from bench.images import photographs
+from bench.registry import discovery, spec
+from bench.runner.other_releases import Population
 from bench.tasks.reconstruction import RELEASES, Reconstruction, view
 from bench.testing import NO_UNIT, shot
 from bench.types import Features, Floats, Knowledge, Release, Subspaces
 from defenses.affine import Affine
 from defenses.ldp import LDP
-from leaderboard.reproduce.intervals import interval
+from leaderboard.intervals import interval
 from metrics.angle import Angle
 
 SUB_DATABASES = 4  # fewer and smaller than in earnest, so that few releases of others cover them
@@ -86,7 +86,7 @@ def rewritten(release: Subspaces, rng: np.random.Generator) -> Subspaces:
 def on_subspaces() -> list[type[Attack]]:
     return [
         attack
-        for attack in registry.everything(registry.ATTACK)
+        for attack in discovery.everything(discovery.ATTACK)
         if issubclass(attack, DescriptorAttack) and Subspaces in attack.accepts
     ]
 
@@ -129,7 +129,7 @@ def less(attack: Attack, secret: Features, defense: Affine | LDP) -> tuple[Float
 
 KNOWING = [
     attack
-    for attack in registry.everything(registry.ATTACK)
+    for attack in discovery.everything(discovery.ATTACK)
     if issubclass(attack, DescriptorAttack) and attack.needs & (RELEASES | {Knowledge.DATABASE, Knowledge.PUBLIC_DATABASE})
 ]
 
@@ -145,6 +145,6 @@ def test_nobody_gains_by_knowing_less(plugin, database, secret):
 def test_a_gain_by_knowing_less_would_be_noticed(database, secret):
     """Negative control: with the two turned around the interval does not hold zero."""
     with_all, with_less = less(
-        spec.read("database", registry.ATTACK), secret, Affine(dim=4, database=database, sub_databases=SUB_DATABASES)
+        spec.read("database", discovery.ATTACK), secret, Affine(dim=4, database=database, sub_databases=SUB_DATABASES)
     )
     assert interval(with_less - with_all).low > 0

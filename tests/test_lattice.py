@@ -8,11 +8,11 @@ import pytest
 from lifted import centres, errors, features, lifted, sift, turned, view
 
 from attacks.lattice import Lattice
-from bench.features.sift import Sift
-from bench.kernels.lattice import integer_vectors, reduced, short_vectors, unit_integer_points
-from bench.kernels.search import unit_rows
-from bench.kernels.subspaces import guesses
-from bench.public import Public
+from bench.codebook.public import Public
+from bench.extractors.sift import Sift
+from bench.geometry.lattice import integer_vectors, reduced, short_vectors, unit_integer_points
+from bench.geometry.nearest_words import unit_rows
+from bench.geometry.subspaces import guesses
 from bench.types import Subspaces
 from defenses.affine import Affine
 

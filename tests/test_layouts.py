@@ -12,11 +12,12 @@ from fakes import scene
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from bench import registry
-from bench.datasets import aachen, colmap, export, lists, nvm
-from bench.datasets.scene import Scene, SceneImage
-from bench.errors import UnitError, UserError
-from bench.spec import read
+from bench.core.errors import UnitError, UserError
+from bench.datasets import aachen, colmap
+from bench.formats import lists, nvm, scene_export
+from bench.images.scene import Scene, SceneImage
+from bench.registry import discovery
+from bench.registry.spec import read
 
 LOADERS: dict[str, Callable[[Path], Scene]] = {"aachen": aachen.load, "colmap": colmap.load}
 
@@ -31,7 +32,7 @@ def written(original: Scene, tmp_path_factory: pytest.TempPathFactory) -> dict[s
     """The scene in each layout; never changed."""
     folder = tmp_path_factory.mktemp("layouts")
     for layout in LOADERS:
-        export.write(original, layout, folder / layout)
+        scene_export.write(original, layout, folder / layout)
     return {layout: folder / layout for layout in LOADERS}
 
 
@@ -89,7 +90,7 @@ def test_what_is_written_is_read_again(layout: str, original: Scene, written: di
 
 def test_plugins_read_the_layouts(written: dict[str, Path]) -> None:
     for layout, folder in written.items():
-        assert len(read(f"{layout}:path={folder}", registry.DATASET).scene().references) == 3
+        assert len(read(f"{layout}:path={folder}", discovery.DATASET).scene().references) == 3
 
 
 def test_pycolmap_reads_the_written_model_and_finds_the_same_poses(original: Scene, written: dict[str, Path]) -> None:
@@ -131,7 +132,7 @@ def test_ground_truth_may_be_a_model_a_list_or_absent(original: Scene, here: dic
     (root / "ground_truth.txt").unlink()
     assert all(query.cam_from_world is None for query in colmap.load(root).queries)
     (root / "ground_truth").mkdir()
-    export.model(original.queries).write(root / "ground_truth")
+    scene_export.model(original.queries).write(root / "ground_truth")
     assert all(same(one, other) for one, other in zip(original.queries, colmap.load(root).queries, strict=True))
 
 
@@ -310,7 +311,7 @@ def test_aachen_needs_both_conditions(here: dict[str, Path], original: Scene, tm
         aachen.load(here["aachen"])
     by_day = Scene(name="day", references=original.references, queries=original.queries[:2])
     with pytest.raises(UserError, match="--layout aachen: needs queries by day and by night; these are by day"):
-        export.write(by_day, "aachen", tmp_path / "new")
+        scene_export.write(by_day, "aachen", tmp_path / "new")
     assert not (tmp_path / "new").exists()
 
 
@@ -321,7 +322,7 @@ def test_aachen_s_folders_of_both_versions(here: dict[str, Path], original: Scen
     (root / "images_upright").rename(root / "images" / "images_upright")
     later = root / "3D-models" / "aachen_v_1_1"
     later.mkdir()
-    export.model(original.references[:2]).write_text(later)
+    scene_export.model(original.references[:2]).write_text(later)
     first = root / "queries" / "night_time_queries_with_intrinsics.txt"
     second = root / "queries" / "night_time_queries_with_intrinsics_v1_1.txt"
     with pytest.raises(UserError, match=r"models of both versions are there; say which, v1 or v1\.1"):
@@ -376,6 +377,6 @@ def test_results_are_written_as_the_server_wants_them(original: Scene, tmp_path:
 
 def test_nothing_is_written_over(original: Scene, written: dict[str, Path], tmp_path: Path) -> None:
     with pytest.raises(UserError, match="exists already; name a new folder"):
-        export.write(original, "colmap", written["colmap"])
+        scene_export.write(original, "colmap", written["colmap"])
     with pytest.raises(UserError, match="--layout nerf: there is aachen and colmap"):
-        export.write(original, "nerf", tmp_path / "x")
+        scene_export.write(original, "nerf", tmp_path / "x")

@@ -17,12 +17,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from bench import protection
-from bench.errors import UserError
-from bench.exact import Exact, exact
-from bench.features import dictionary
-from bench.kernels.search import unit_rows
-from bench.kernels.subset import (
+from bench.api import Asset, Privacy
+from bench.codebook import dictionary
+from bench.codebook.public import Public
+from bench.core.errors import UserError
+from bench.core.exact import Exact, exact
+from bench.geometry.nearest_words import unit_rows
+from bench.mechanisms import protection
+from bench.mechanisms.subset import (
     chance_digits,
     draw_distinct,
     draw_told,
@@ -32,8 +34,6 @@ from bench.kernels.subset import (
     most_informative_size,
     word_subsets,
 )
-from bench.plugin import Asset, Privacy
-from bench.public import Public
 from bench.types import Features
 from defenses.ldp import PLUGIN as LDP
 

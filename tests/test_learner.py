@@ -5,11 +5,11 @@ import pytest
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
-from attacks.inversion.encoding import Points, encode
-from attacks.inversion.learner import Learner
-from attacks.inversion.network import Inverter, Shape
-from attacks.inversion.plan import Training
-from bench.device import pick_dtype
+from bench.core.device import pick_dtype
+from bench.inversion.encoding import Points, encode
+from bench.inversion.learner import Learner
+from bench.inversion.network import Inverter, Shape
+from bench.inversion.plan import Training
 from bench.types import Descriptors
 
 BATCH, KEYPOINTS = 8, 600

@@ -10,21 +10,24 @@ import pytest
 from test_localization_mapping import KEPT, STRETCH, WALK
 
 from attacks.inlier import Inlier
-from bench import cache, cli, runner
-from bench.datasets import aachen, export, lists
+from bench import cli
+from bench.api import Asset, Defense
+from bench.cache import store
+from bench.core.errors import UserError
+from bench.datasets import aachen
 from bench.datasets.aachen import Aachen
-from bench.datasets.scene import Scene
-from bench.errors import UserError
-from bench.features.sift import Sift
+from bench.extractors.sift import Sift
+from bench.formats import lists, scene_export
+from bench.images.scene import Scene
 from bench.localization import pairs, pose
-from bench.plugin import Asset, Defense
-from bench.records import Record
+from bench.runner import plan
+from bench.runner.records import Record
 from bench.tasks.localization import THRESHOLDS, Localization, within
 from bench.testing import small_dictionary
 from defenses.affine import Affine
 from defenses.ldp import LDP
 from defenses.none import Undefended
-from leaderboard import localized
+from leaderboard import localization_results
 
 SIFT = Sift(max_keypoints=400)
 STRICT = "recall_0.25m_2deg"
@@ -33,7 +36,7 @@ STRICT = "recall_0.25m_2deg"
 @pytest.fixture(scope="module", autouse=True)
 def _cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patched:
-        patched.setenv(cache.VARIABLE, str(tmp_path_factory.mktemp("cache")))
+        patched.setenv(store.VARIABLE, str(tmp_path_factory.mktemp("cache")))
         yield
 
 
@@ -44,12 +47,14 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     between = [image for number, image in enumerate(taken) if number not in KEPT]
     queries = [replace(image, condition="night" if number > 2 else "day") for number, image in enumerate(between)]
     out = tmp_path_factory.mktemp("place") / "aachen"
-    export.write(Scene(name="stretch", references=tuple(taken[number] for number in KEPT), queries=tuple(queries)), "aachen", out)
+    scene_export.write(
+        Scene(name="stretch", references=tuple(taken[number] for number in KEPT), queries=tuple(queries)), "aachen", out
+    )
     return out
 
 
 def run(place: Path, *defenses: Defense, **task: object) -> list[Record]:
-    return runner.run(list(defenses), task=Localization(trials=3000, **task), dataset=Aachen(path=place), extractor=SIFT)
+    return plan.run(list(defenses), task=Localization(trials=3000, **task), dataset=Aachen(path=place), extractor=SIFT)
 
 
 def mean(records: list[Record], metric: str = STRICT) -> float:
@@ -133,7 +138,7 @@ def _retrieved(record: Record) -> list[str]:
 def test_the_inlier_attack_verifies_whatever_the_server_can_localize(place: Path) -> None:
     """Of subspaces all references are tried, for they do not tell which to retrieve; random words verify next to nothing."""
     random = LDP(dictionary=Asset("references"), words=1000, epsilon=0.0)
-    found = runner.run([Undefended(), Affine(), random], [Inlier(retrieved=1, trials=3000)], dataset=Aachen(path=place))
+    found = plan.run([Undefended(), Affine(), random], [Inlier(retrieved=1, trials=3000)], dataset=Aachen(path=place))
     verified: dict[str, list[int]] = {}
     for record in found:
         verified.setdefault(record["defense"]["name"], []).append(int(record["notes"][-1].split()[0]))
@@ -232,7 +237,7 @@ def test_wrong_intrinsics_are_reported_and_not_averaged(
 
 def test_pairs_are_written_and_read_again(place: Path, raw: list[Record], tmp_path: Path) -> None:
     written = tmp_path / "pairs.txt"
-    assert next(localized.write(raw, tmp_path)) == f"{written}: what was retrieved for 5 queries"
+    assert next(localization_results.write(raw, tmp_path)) == f"{written}: what was retrieved for 5 queries"
     assert pairs.read(written) == {record["unit"]: _retrieved(record) for record in raw}
     again = run(place, Undefended(), pairs=written)
     assert [record["metrics"] for record in again] == [record["metrics"] for record in raw]
@@ -242,7 +247,7 @@ def test_pairs_are_written_and_read_again(place: Path, raw: list[Record], tmp_pa
     assert {record["unit"]: _retrieved(record) for record in fewer} == kept
     assert mean(fewer, "matches") < mean(raw, "matches")
     other = [{**record, "cell_id": "other", "defense": {"name": "affine", "dim": 2}} for record in fewer]
-    assert len(list(localized.write([*raw, *other], tmp_path))) == 4  # of each its pairs and its poses
+    assert len(list(localization_results.write([*raw, *other], tmp_path))) == 4  # of each its pairs and its poses
     assert pairs.read(tmp_path / "pairs-affine_dim_2-seed0.txt") == kept
 
 

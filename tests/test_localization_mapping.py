@@ -5,17 +5,17 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from bench.codebook.build import cluster
+from bench.core.errors import UserError
 from bench.datasets.gallery import Gallery, shot
-from bench.datasets.scene import Reference
-from bench.errors import UserError
-from bench.features.build import cluster
-from bench.features.sift import Sift
-from bench.kernels.search import WordIndex, unit_rows
-from bench.kernels.subset import word_subsets
-from bench.localization import covisible, mapping, pose
+from bench.extractors.sift import Sift
+from bench.geometry.nearest_words import WordIndex, unit_rows
+from bench.images.scene import Reference
+from bench.localization import covisibility, mapping, pose
+from bench.localization.map_matching import Correspondences, MutualNN, Retrieved, Vocabulary
 from bench.localization.maps import Map
-from bench.localization.matching import Correspondences, MutualNN, Retrieved, Vocabulary
 from bench.localization.retrieval import Bags
+from bench.mechanisms.subset import word_subsets
 from bench.testing import example_features
 from bench.types import Bytes, Descriptors, Features, WordSets
 
@@ -101,7 +101,7 @@ def test_references_that_share_nothing_make_no_map(references: Taken) -> None:
 
 def test_neighbours_are_the_nearest_that_look_the_same_way(references: Taken) -> None:
     images = references[0]
-    chosen = covisible.pairs(images, neighbours=3, turn=40)
+    chosen = covisibility.pairs(images, neighbours=3, turn=40)
     expected = set()
     for a, one in enumerate(images):
         found = []

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from test_distances import residual, subspaces
 
-from bench.kernels.search import unit_rows
-from bench.localization import matching
+from bench.api import Defense
+from bench.geometry.nearest_words import unit_rows
+from bench.localization import map_matching
+from bench.localization.map_matching import Matcher, MutualNN, PointToSubspace, Retrieved, SubspaceToSubspace, Vocabulary
 from bench.localization.maps import Map, from_arrays
-from bench.localization.matching import Matcher, MutualNN, PointToSubspace, Retrieved, SubspaceToSubspace, Vocabulary
-from bench.plugin import Defense
 from bench.testing import example_features
 from bench.types import Descriptors, Indices, Release, Subspaces, WordSets
 from defenses.affine import Affine
@@ -64,11 +64,11 @@ def raw(seen: Map, rng: np.random.Generator) -> Descriptors:
     return Descriptors(keypoints=np.zeros((10, 2), dtype=np.float32), size=(9, 9), descriptors=near(seen, rng, 10))
 
 
-def pairs(found: matching.Correspondences) -> list[tuple[int, int]]:
+def pairs(found: map_matching.Correspondences) -> list[tuple[int, int]]:
     return list(zip(found.keypoints.tolist(), found.points.tolist(), strict=True))
 
 
-def check_rows(found: matching.Correspondences, retrieved: Retrieved) -> None:
+def check_rows(found: map_matching.Correspondences, retrieved: Retrieved) -> None:
     """The rows that pairs are due to are of retrieved references, and of those points."""
     assert (retrieved.map.points[found.rows] == found.points).all()
     assert np.isin(found.rows // 14, retrieved.references).all()
@@ -173,10 +173,10 @@ def test_matcher_is_chosen_by_type() -> None:
         NaiveLDP(): "mutual-nn",
         Affine(): "point-to-subspace",
     }
-    assert {defense: matching.default(defense) for defense in chosen} == chosen
-    assert matching.inapplicable("mutual-nn", LDP()) is None
-    assert matching.inapplicable("vocabulary", Affine()) == "vocabulary matches WordSets; affine releases Subspaces"
-    assert matching.inapplicable("vocabulary", NaiveLDP()) == "vocabulary matches words of a dictionary; naive-ldp has none"
+    assert {defense: map_matching.default(defense) for defense in chosen} == chosen
+    assert map_matching.inapplicable("mutual-nn", LDP()) is None
+    assert map_matching.inapplicable("vocabulary", Affine()) == "vocabulary matches WordSets; affine releases Subspaces"
+    assert map_matching.inapplicable("vocabulary", NaiveLDP()) == "vocabulary matches words of a dictionary; naive-ldp has none"
 
 
 def test_release_of_another_type_is_refused(seen: Map, retrieved: Retrieved, rng: np.random.Generator) -> None:

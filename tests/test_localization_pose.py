@@ -7,7 +7,7 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bench.errors import UserError
+from bench.core.errors import UserError
 from bench.localization import pose
 from bench.localization.pose import Solver
 

@@ -9,8 +9,10 @@ import torch
 from fake_plugins.painter import Painter
 from fakes import FAKES, album, install
 
-from bench import cli, registry, runner, spec, testing
-from bench.errors import UserError
+from bench import cli, testing
+from bench.core.errors import UserError
+from bench.registry import discovery, spec
+from bench.runner import plan as runner
 from defenses.none import Undefended
 
 pytest.importorskip("lpips", reason="the library is not installed (pip install -e '.[lpips]')")
@@ -69,7 +71,7 @@ def test_it_is_what_the_paper_says(weights: Path, images: tuple[np.ndarray, np.n
 
 
 def test_it_keeps_the_contract_of_metrics(weights: Path) -> None:
-    registry.check(registry.METRIC, LPIPS)
+    discovery.check(discovery.METRIC, LPIPS)
     testing.check_metric(LPIPS(weights=weights))
 
 
@@ -79,8 +81,8 @@ def test_its_settings_are_the_weights_by_content(weights: Path, tmp_path: Path) 
         runner.Asked(
             pairs=((Undefended(), Painter()),),
             images=tmp_path / "album",
-            task=spec.read("reconstruction", registry.TASK),
-            extractor=spec.read("sift", registry.EXTRACTOR),
+            task=spec.read("reconstruction", discovery.TASK),
+            extractor=spec.read("sift", discovery.EXTRACTOR),
             dataset=None,
             seed=0,
             metrics=(LPIPS(weights=weights),),

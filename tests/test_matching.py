@@ -9,13 +9,13 @@ import pytest
 from fakes import texture, trial
 
 import bench
-from bench import matching
-from bench.datasets.homographies import Pair
-from bench.datasets.scene import File
-from bench.errors import UserError
-from bench.kernels.words import sharing
-from bench.plugin import Asset, Defense, Outcome
-from bench.public import Public
+from bench.api import Asset, Defense, Outcome
+from bench.codebook.public import Public
+from bench.core.errors import UserError
+from bench.geometry.shared_words import sharing
+from bench.images.scene import File
+from bench.localization import two_view_matching
+from bench.rendering.homographies import Pair
 from bench.tasks.matching import WITHIN, Matching, accuracy, transferred
 from bench.testing import example_features, shot, small_dictionary
 from bench.types import Features, Release
@@ -101,8 +101,8 @@ DEFENSES: list[Callable[[Asset], Defense]] = [
 @pytest.mark.parametrize("both", [False, True])
 def test_the_same_features_match_themselves(words: Asset, defense: Callable[[Asset], Defense], both: bool) -> None:
     plugin = defense(words)
-    second = released(plugin, seed=1) if both else matching.unprotected(SECRET, plugin, Public())
-    found = {tuple(pair) for pair in matching.matches(released(plugin), second).tolist()}
+    second = released(plugin, seed=1) if both else two_view_matching.unprotected(SECRET, plugin, Public())
+    found = {tuple(pair) for pair in two_view_matching.matches(released(plugin), second).tolist()}
     assert len({(i, i) for i in range(60)} & found) > 55
     assert len(found) < 120
 
@@ -111,7 +111,7 @@ def test_the_same_features_match_themselves(words: Asset, defense: Callable[[Ass
 def test_strangers_do_not_match_more_than_chance(words: Asset, defense: Callable[[Asset], Defense]) -> None:
     """Negative control: descriptors in another order."""
     plugin, shuffled = defense(words), SECRET.take(np.random.default_rng(0).permutation(60))
-    found = matching.matches(released(plugin), matching.unprotected(shuffled, plugin, Public()))
+    found = two_view_matching.matches(released(plugin), two_view_matching.unprotected(shuffled, plugin, Public()))
     assert (found[:, 0] == found[:, 1]).mean() < 0.15
 
 
@@ -150,13 +150,13 @@ def test_another_dictionary_matches_nothing(tmp_path: Path, words: Asset) -> Non
     """Negative control: the same numbers stand for other words."""
     release = released(LDP(dictionary=words, epsilon=20.0))
     stranger = LDP(dictionary=small_dictionary(tmp_path, 5_000, seed=7), epsilon=20.0)
-    assert len(matching.matches(release, matching.unprotected(SECRET, stranger, Public()))) < 10
+    assert len(two_view_matching.matches(release, two_view_matching.unprotected(SECRET, stranger, Public()))) < 10
 
 
 def test_ratio_test_leaves_fewer_and_better_matches() -> None:
     first, second = example_features(60, seed=1), example_features(80, seed=2)
-    all_of_them = matching.matches(released(Undefended(), first), released(Undefended(), second))
-    strict = matching.matches(released(Undefended(), first), released(Undefended(), second), ratio=0.8)
+    all_of_them = two_view_matching.matches(released(Undefended(), first), released(Undefended(), second))
+    strict = two_view_matching.matches(released(Undefended(), first), released(Undefended(), second), ratio=0.8)
     assert {tuple(pair) for pair in strict} < {tuple(pair) for pair in all_of_them}
 
 

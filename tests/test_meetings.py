@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from bench.features import dictionary
-from bench.kernels.meetings import MEETS, meetings, meetings_within, nearest_points
-from bench.kernels.rebuilding import bytes_of, rebuilt
-from bench.kernels.search import unit_rows
-from bench.kernels.sharing import stacked
-from bench.plugin import Asset
-from bench.public import Public
+from bench.api import Asset
+from bench.codebook import dictionary
+from bench.codebook.public import Public
+from bench.geometry.database_reconstruction import bytes_of, rebuilt
+from bench.geometry.intersections import MEETS, meetings, meetings_within, nearest_points
+from bench.geometry.nearest_words import unit_rows
+from bench.geometry.shared_sub_database import stacked
 from bench.testing import example_features, small_dictionary
 from bench.types import Subspaces
 from defenses.affine import Affine

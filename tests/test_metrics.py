@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from skimage import metrics as reference
 
-from bench.datasets import photographs
-from bench.plugin import Metric
+from bench.api import Metric
+from bench.images import photographs
 from metrics import angle, face, l2, mae, mse, psnr, recovered, ssim
 
 IMAGES = [face.PLUGIN, mae.PLUGIN, mse.PLUGIN, psnr.PLUGIN, ssim.PLUGIN]

@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from bench.errors import UserError
-from bench.kernels.search import unit_rows
-from bench.kernels.subset import draw_told, pattern_subsets
-from bench.plugin import Privacy
-from bench.public import Public
+from bench.api import Privacy
+from bench.codebook.public import Public
+from bench.core.errors import UserError
+from bench.geometry.nearest_words import unit_rows
+from bench.mechanisms.subset import draw_told, pattern_subsets
 from bench.types import Features
 from defenses.naive_ldp import PLUGIN as NAIVE
 from defenses.naive_ldp import finite_floats

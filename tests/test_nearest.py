@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from attacks.nearest import Nearest
-from bench.features import dictionary
-from bench.features.sift import Sift
-from bench.kernels.search import unit_rows
-from bench.kernels.subspaces import nearest_to_subspaces
-from bench.plugin import Asset, View
-from bench.public import Public
+from bench.api import Asset, View
+from bench.codebook import dictionary
+from bench.codebook.public import Public
+from bench.extractors.sift import Sift
+from bench.geometry.nearest_words import unit_rows
+from bench.geometry.subspaces import nearest_to_subspaces
 from bench.types import Features, Knowledge
 from defenses.affine import Affine
 

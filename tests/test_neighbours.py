@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from bench.kernels import neighbours
-from bench.kernels.neighbours import Neighbours
+from bench.geometry import neighbours
+from bench.geometry.neighbours import Neighbours
 from bench.testing import example_features
 
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from fakes import texture
 
-from bench.errors import UserError
-from bench.features.sift import Sift
-from bench.plugin import Privacy
-from bench.public import Public
+from bench.api import Privacy
+from bench.codebook.public import Public
+from bench.core.errors import UserError
+from bench.extractors.sift import Sift
 from bench.testing import example_features
 from bench.types import Features
 from defenses.none import PLUGIN

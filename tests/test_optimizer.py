@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import nn
 
-from attacks.inversion.optimizer import Optimizer
+from bench.inversion.optimizer import Optimizer
 
 RATE, DECAY = 0.01, 0.1
 MATRICES = "0.weight", "2.weight", "4.weight"

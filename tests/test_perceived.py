@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 
-from bench.errors import UserError
+from bench.core.errors import UserError
 
 models = pytest.importorskip("torchvision.models", reason="torchvision is not installed (pip install -e '.[lpips]')")
 SEEN = ("features.3", "features.8", "features.15")  # the last layers before VGG-16's first three poolings

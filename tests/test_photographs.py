@@ -7,9 +7,9 @@ import pytest
 from fakes import album, texture
 from PIL import Image
 
-from bench.datasets import photographs
-from bench.errors import UnitError, UserError
-from bench.features.sift import Sift
+from bench.core.errors import UnitError, UserError
+from bench.extractors.sift import Sift
+from bench.images import photographs
 
 
 def save(path: Path, image: Image.Image, **options: object) -> Path:

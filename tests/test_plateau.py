@@ -13,11 +13,11 @@ from scipy import stats
 
 from bench.audit.auditor import audit, near_words
 from bench.audit.exhaustive import law
-from bench.errors import UserError
-from bench.exact import Exact
-from bench.kernels.search import unit_rows
-from bench.kernels.subset import chance_digits, word_subsets
-from bench.public import Public
+from bench.codebook.public import Public
+from bench.core.errors import UserError
+from bench.core.exact import Exact
+from bench.geometry.nearest_words import unit_rows
+from bench.mechanisms.subset import chance_digits, word_subsets
 from bench.testing import example_features, small_dictionary
 from bench.types import Features, WordSets
 from defenses.ldp import LDP

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from fakes import album
 
-from bench import randomness as seeds
-from bench.datasets.photographs import Source, folder
-from bench.features.sift import Sift
-from bench.kernels.search import unit_rows
-from bench.population import Population, window
-from bench.public import Public
+from bench.codebook.public import Public
+from bench.core import randomness as seeds
+from bench.extractors.sift import Sift
+from bench.geometry.nearest_words import unit_rows
+from bench.images.photographs import Source, folder
+from bench.runner.other_releases import Population, window
 from defenses.none import Undefended
 
 

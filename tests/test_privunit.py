@@ -10,10 +10,10 @@ import pytest
 from scipy import stats
 
 from bench.audit.auditor import audit
-from bench.errors import UserError
-from bench.kernels.subset import chance_digits
-from bench.localization import matching
-from bench.public import Public
+from bench.codebook.public import Public
+from bench.core.errors import UserError
+from bench.localization import map_matching
+from bench.mechanisms.subset import chance_digits
 from bench.testing import example_features, small_dictionary
 from bench.types import Descriptors, Features
 from defenses.privunit import GRID, PLACES, PrivUnit, cap, expected_cosine, latitude, near, without
@@ -133,5 +133,5 @@ def test_mistakes(epsilon: float) -> None:
 
 
 def test_it_is_matched_without_lowes_test() -> None:
-    assert matching.default(PrivUnit()) == "noisy-nn"
-    assert matching.MATCHERS["noisy-nn"]().ratio == 1.0  # type: ignore[attr-defined]
+    assert map_matching.default(PrivUnit()) == "noisy-nn"
+    assert map_matching.MATCHERS["noisy-nn"]().ratio == 1.0  # type: ignore[attr-defined]

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import bench
-from bench import protection
-from bench.errors import UserError
-from bench.plugin import Asset
-from bench.public import Public
+from bench.api import Asset
+from bench.codebook.public import Public
+from bench.core.errors import UserError
+from bench.mechanisms import protection
 from bench.testing import example_features, same, small_dictionary
 from bench.types import Descriptors, WordSets
 from defenses.ldp import LDP

@@ -6,9 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench import registry, testing
+from bench import testing
 from bench.cli import parser
-from bench.public import Public
+from bench.codebook.public import Public
+from bench.registry import discovery
 
 README = (Path(__file__).resolve().parents[1] / "README.md").read_text(encoding="utf-8")
 
@@ -19,7 +20,7 @@ def test_the_defense_in_twenty_lines(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     import rounding
 
-    plugin = registry.check(registry.DEFENSE, rounding.PLUGIN)
+    plugin = discovery.check(discovery.DEFENSE, rounding.PLUGIN)
     secret = testing.example_features(20, 0)
     release = plugin(levels=4).protect(secret, Public(), np.random.default_rng(0))
     assert set(np.unique(release.descriptors * 4)) <= {0, 1, 2, 3, 4}

@@ -9,18 +9,20 @@ import pytest
 from fabricated import PHOTOGRAPHS, ldp, reconstructions
 from fakes import album
 
-from bench import cli, registry, runner, spec
-from bench.commands import run
+from bench import cli
+from bench.api import Attack, Defense, Extractor
+from bench.cli.commands import run
 from bench.datasets.gallery import Gallery
-from bench.features.sift import Sift
-from bench.plugin import Attack, Defense, Extractor
-from bench.records import short_hash
-from bench.runner import Asked, Plan
+from bench.extractors.sift import Sift
+from bench.registry import discovery, spec
+from bench.runner import plan as runner
+from bench.runner.plan import Asked, Plan
+from bench.runner.records import short_hash
 from bench.tasks.collisions import Collisions
 from bench.tasks.localization import Localization
 from bench.tasks.reconstruction import Reconstruction
 from bench.testing import small_dictionary
-from leaderboard.boards import Cell, Found
+from leaderboard.comparison import Cell, Found
 from leaderboard.recipe import recipe
 
 
@@ -30,12 +32,12 @@ def planned(command: str) -> Plan:
     assert program == "bench"
     args, extra = cli.parser().parse_known_args(words)
     assert not extra
-    task = spec.read(args.task, registry.TASK)
-    attacks: list[Attack] = [spec.read(text, registry.ATTACK) for text in args.attack or []]
+    task = spec.read(args.task, discovery.TASK)
+    attacks: list[Attack] = [spec.read(text, discovery.ATTACK) for text in args.attack or []]
     defenses: list[Defense] = [run._defense(text, task) for text in args.defense]
     pairs = tuple((defense, attack) for defense in defenses for attack in attacks or [None])
-    extractor: Extractor = spec.read(args.extractor, registry.EXTRACTOR)
-    dataset = None if args.dataset is None else spec.read(args.dataset, registry.DATASET)
+    extractor: Extractor = spec.read(args.extractor, discovery.EXTRACTOR)
+    dataset = None if args.dataset is None else spec.read(args.dataset, discovery.DATASET)
     return runner.planned(Asked(pairs=pairs, images=args.images, task=task, extractor=extractor, dataset=dataset, seed=args.seed))
 
 
@@ -64,7 +66,7 @@ def test_the_command_is_the_cell(
 ) -> None:
     album(tmp_path / "my album")
     monkeypatch.chdir(tmp_path)
-    pairs = ((spec.read(defense, registry.DEFENSE), spec.read(attack, registry.ATTACK)),)
+    pairs = ((spec.read(defense, discovery.DEFENSE), spec.read(attack, discovery.ATTACK)),)
     asked = Asked(pairs=pairs, images=Path("my album"), task=Reconstruction(), extractor=extractor, dataset=None, seed=7)
     plan = runner.planned(asked)
     (cell,) = written(plan)
@@ -74,7 +76,7 @@ def test_the_command_is_the_cell(
 
 def test_what_is_as_by_default_is_not_spelt_out(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = Asked(
-        pairs=((spec.read("affine", registry.DEFENSE), None),),
+        pairs=((spec.read("affine", discovery.DEFENSE), None),),
         images=None,
         task=Collisions(),
         extractor=Sift(),
@@ -88,7 +90,7 @@ def test_what_is_as_by_default_is_not_spelt_out(monkeypatch: pytest.MonkeyPatch)
 
 def test_words_of_a_place_are_made_there_again() -> None:
     tiny = Gallery(width=64, height=48, detail=0.1, views=2, queries=2)
-    ldp = spec.read("ldp:epsilon=9,words=32,dictionary=references", registry.DEFENSE)
+    ldp = spec.read("ldp:epsilon=9,words=32,dictionary=references", discovery.DEFENSE)
     task = Localization(retrieval="released", trials=100)
     plan = runner.planned(Asked(pairs=((ldp, None),), images=None, task=task, extractor=Sift(), dataset=tiny, seed=1))
     (cell,) = written(plan)
@@ -105,7 +107,7 @@ def test_files_of_ones_own_are_named_by_their_digest(tmp_path: Path, monkeypatch
     own = small_dictionary(tmp_path)
     album(tmp_path / "album")
     monkeypatch.chdir(tmp_path)
-    pairs = ((spec.read(f"ldp:epsilon=5,dictionary={own}", registry.DEFENSE), spec.read("keypoints", registry.ATTACK)),)
+    pairs = ((spec.read(f"ldp:epsilon=5,dictionary={own}", discovery.DEFENSE), spec.read("keypoints", discovery.ATTACK)),)
     plan = runner.planned(Asked(pairs=pairs, images=Path("album"), task=Reconstruction(), extractor=Sift(), dataset=None, seed=0))
     (cell,) = written(plan)
     found = recipe(cell)

@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 
 import bench
-from bench import records
-from bench.errors import UserError
-from bench.records import Log, read
+from bench.core.errors import UserError
+from bench.runner import records
+from bench.runner.records import Log, read
 
 
 def record(unit: str, **more: Any) -> dict[str, Any]:

@@ -10,54 +10,54 @@ import numpy as np
 import pytest
 from fakes import FAKES, install
 
-from bench import registry
-from bench.errors import UserError
-from bench.plugin import Attack, Defense, Metric, Privacy
-from bench.public import Public
+from bench.api import Attack, Defense, Metric, Privacy
+from bench.codebook.public import Public
+from bench.core.errors import UserError
+from bench.registry import discovery
 from bench.types import Descriptors, Features, Release
 
 
 def test_built_in_plugins_are_found_by_file_name() -> None:
-    assert {"affine", "ldp", "naive-ldp", "none"} <= set(registry.discover(registry.DEFENSE))
-    assert {"mae", "psnr", "ssim"} <= set(registry.discover(registry.METRIC))
-    assert "reconstruction" in registry.discover(registry.TASK)
+    assert {"affine", "ldp", "naive-ldp", "none"} <= set(discovery.discover(discovery.DEFENSE))
+    assert {"mae", "psnr", "ssim"} <= set(discovery.discover(discovery.METRIC))
+    assert "reconstruction" in discovery.discover(discovery.TASK)
 
 
 def test_modules_without_plugin_and_subpackages_are_skipped() -> None:
-    extractors = registry.discover(registry.EXTRACTOR)
+    extractors = discovery.discover(discovery.EXTRACTOR)
     assert {"hloc", "sift"} <= set(extractors)
     assert not {"dictionary", "build"} & set(extractors)
-    assert "inversion" not in registry.discover(registry.ATTACK)
+    assert "inversion" not in discovery.discover(discovery.ATTACK)
 
 
 def test_external_plugins_are_found_by_entry_point(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     install(tmp_path, monkeypatch, FAKES)
-    assert registry.lookup(registry.ATTACK, "painter").name() == "painter"
-    assert registry.lookup(registry.DEFENSE, "broken").summary() == "Fails at every photograph."
+    assert discovery.lookup(discovery.ATTACK, "painter").name() == "painter"
+    assert discovery.lookup(discovery.DEFENSE, "broken").summary() == "Fails at every photograph."
 
 
 def test_two_plugins_of_one_name_are_refused_with_both_origins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     install(tmp_path, monkeypatch, {"feature_privacy.defenses": {"ldp": "fake_plugins.broken:PLUGIN"}}, name="stranger")
     with pytest.raises(UserError, match=r"two defense plugins are called 'ldp': defenses\.ldp and fake_plugins.*stranger"):
-        registry.lookup(registry.DEFENSE, "none")
+        discovery.lookup(discovery.DEFENSE, "none")
 
 
 def test_entry_point_must_have_the_name_of_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     install(tmp_path, monkeypatch, {"feature_privacy.defenses": {"other": "fake_plugins.broken:PLUGIN"}})
     with pytest.raises(UserError, match=r"'other'.*'broken'"):
-        registry.lookup(registry.DEFENSE, "other")
+        discovery.lookup(discovery.DEFENSE, "other")
 
 
 def test_plugin_that_cannot_be_imported_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     install(tmp_path, monkeypatch, {"feature_privacy.defenses": {"absent": "no_such_module:PLUGIN"}}, name="stranger")
-    assert registry.lookup(registry.DEFENSE, "none")  # the others are not affected
+    assert discovery.lookup(discovery.DEFENSE, "none")  # the others are not affected
     with pytest.raises(UserError, match=r"no_such_module.*stranger.*cannot be imported"):
-        registry.lookup(registry.DEFENSE, "absent")
+        discovery.lookup(discovery.DEFENSE, "absent")
 
 
 def test_misspelt_name_gets_a_hint_and_the_list() -> None:
     with pytest.raises(UserError, match=r"unknown defense 'lpd'; did you mean 'ldp'\?.*affine.*none"):
-        registry.lookup(registry.DEFENSE, "lpd")
+        discovery.lookup(discovery.DEFENSE, "lpd")
 
 
 def frozen(base: type, **body: Any) -> type:
@@ -81,7 +81,7 @@ GOOD = {"releases": Descriptors, "protect": protect, "privacy": privacy}
 
 
 def test_right_plugin_is_accepted() -> None:
-    registry.check(registry.DEFENSE, frozen(Defense, __annotations__={"strength": float}, strength=1.0, **GOOD))
+    discovery.check(discovery.DEFENSE, frozen(Defense, __annotations__={"strength": float}, strength=1.0, **GOOD))
 
 
 @pytest.mark.parametrize(
@@ -104,28 +104,32 @@ def test_right_plugin_is_accepted() -> None:
 )
 def test_wrong_defense_is_refused_with_what_is_right(plugin: Any, complaint: str) -> None:
     with pytest.raises(UserError, match=complaint):
-        registry.check(registry.DEFENSE, plugin)
+        discovery.check(discovery.DEFENSE, plugin)
 
 
 def test_attack_must_say_what_it_recovers() -> None:
     with pytest.raises(UserError, match="DescriptorAttack or SelectiveAttack or ImageAttack"):
-        registry.check(registry.ATTACK, frozen(Attack, accepts=(Descriptors,)))
+        discovery.check(discovery.ATTACK, frozen(Attack, accepts=(Descriptors,)))
 
 
 def test_attack_must_not_decide_applicability_itself() -> None:
-    from bench.plugin import ImageAttack
+    from bench.api import ImageAttack
 
     def inapplicable(self: Any, defense: Any, extractor: Any, public: Any) -> None: ...
     def reconstruct(self: Any, view: Any, rng: Any) -> None: ...
 
     wrong = frozen(ImageAttack, accepts=(Descriptors,), reconstruct=reconstruct, inapplicable=inapplicable)
     with pytest.raises(UserError, match="must not override inapplicable"):
-        registry.check(registry.ATTACK, wrong)
+        discovery.check(discovery.ATTACK, wrong)
 
 
 @pytest.mark.parametrize(
     "code",
-    ["import bench.registry", "import bench", "from bench.cli import main\ntry: main(['--help'])\nexcept SystemExit: pass"],
+    [
+        "import bench.registry.discovery",
+        "import bench",
+        "from bench.cli import main\ntry: main(['--help'])\nexcept SystemExit: pass",
+    ],
 )
 def test_heavy_libraries_are_not_imported_before_they_are_needed(code: str) -> None:
     heavy = "{'torch', 'cv2', 'pandas', 'matplotlib', 'skimage', 'h5py'}"

@@ -14,13 +14,13 @@ from scipy import stats
 
 import bench
 from bench import cli
-from bench.kernels.search import unit_rows
-from bench.plugin import View
+from bench.api import View
+from bench.geometry.nearest_words import unit_rows
 from bench.tasks.reconstruction import Reconstruction
 from bench.testing import small_dictionary
 from bench.types import Features, WordSets
 from defenses.ldp import LDP
-from leaderboard import findings, speed
+from leaderboard import regression_report, speed
 from leaderboard.regression import Finding, compare, tolerance
 
 Records = list[dict[str, Any]]
@@ -221,7 +221,7 @@ def test_annotations_are_escaped(folders: tuple[Path, Path], capfd: pytest.Captu
     (line, _) = capfd.readouterr().out.splitlines()
     assert line.startswith("::error title=worse%3A ldp%3Aepsilon=8%2Csubset_size=2%2Cwords=0 against guess::recovered was 0.")
     nasty = Finding(verdict="missing", defense="a::b,100%\r\n::error::", attack="c", told="50%\r\n::stop-commands::x")
-    written = findings.to_github(nasty)
+    written = regression_report.to_github(nasty)
     assert written == (
         "::warning title=missing%3A a%3A%3Ab%2C100%25%0D%0A%3A%3Aerror%3A%3A against c::50%25%0D%0A::stop-commands::x"
     )

@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 
 from attacks.repeat import Repeat
-from bench.errors import UserError
-from bench.features.sift import Sift
-from bench.kernels.repeats import bound_on_success, chances_of_success, common_points, likeliest
-from bench.kernels.search import unit_rows
-from bench.kernels.subset import log10_chance, word_subsets
-from bench.plugin import Defense, View
-from bench.public import Public
+from bench.api import Defense, View
+from bench.codebook.public import Public
+from bench.core.errors import UserError
+from bench.extractors.sift import Sift
+from bench.geometry.nearest_words import unit_rows
+from bench.mechanisms.multi_release import bound_on_success, chances_of_success, common_points, likeliest
+from bench.mechanisms.subset import log10_chance, word_subsets
 from bench.testing import example_features, small_dictionary
 from bench.types import Features, Knowledge, Release, Subspaces
 from defenses.affine import Affine
 from defenses.ldp import LDP
 from defenses.naive_ldp import NaiveLDP
-from leaderboard import repeated
+from leaderboard import multi_release
 
 SECRET = example_features(60)
 STRANGER = example_features(60, seed=9)
@@ -211,11 +211,11 @@ def test_asks_for_as_many_releases_as_it_says():
 
 
 def test_curve():
-    curve = repeated.rows(10.0, 256_000, 2, 10)
+    curve = multi_release.rows(10.0, 256_000, 2, 10)
     assert [row["releases"] for row in curve] == list(range(1, 11))
     assert [row["success"] for row in curve] == chances_of_success(10.0, 256_000, 2, 10)
     assert all(row["success"] <= row["bound"] for row in curve)
-    axes = repeated.draw(curve).axes[0]
+    axes = multi_release.draw(curve).axes[0]
     assert [list(line.get_ydata()) for line in axes.lines] == [
         [row["bound"] for row in curve],
         [row["success"] for row in curve],

@@ -13,13 +13,16 @@ import pytest
 from fakes import texture
 from PIL import Image
 
-from bench import cache, cli, progress, registry
-from bench.features.sift import Sift
-from bench.plugin import Asset, Attack, Defense
-from bench.public import ASSETS, Public
-from bench.records import FILE, Record
+from bench import cli
+from bench.api import Asset, Attack, Defense
+from bench.cache import store
+from bench.codebook.public import ASSETS, Public
+from bench.core import progress
+from bench.extractors.sift import Sift
+from bench.registry import discovery
+from bench.runner.records import FILE, Record
 from bench.tasks.reconstruction import Reconstruction
-from leaderboard.reproduce import command, figures, report, run, tables
+from leaderboard.reproduce import command, figures, page, run, tables
 from leaderboard.reproduce.claims import Claim, Verdict, falling, same_order
 from leaderboard.reproduce.profiles import CPU, SMOKE, Materials, Setting
 from leaderboard.reproduce.run import Judged, Ran
@@ -50,7 +53,7 @@ WALK = "walk:views=4,others=6,steps=60,width=320,height=240,detail=0.3"
 @pytest.fixture(scope="module", autouse=True)
 def _cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patched:
-        patched.setenv(cache.VARIABLE, str(tmp_path_factory.mktemp("cache")))
+        patched.setenv(store.VARIABLE, str(tmp_path_factory.mktemp("cache")))
         yield
 
 
@@ -187,8 +190,8 @@ PAPER = {"raw": 0.7, "two": 0.5, "four": 0.4, "none": 0.1}
 
 
 def made_up_rows(setting: Setting) -> tuple[Row, ...]:
-    defense: Defense = build(registry.DEFENSE, "none", {})
-    attack: Attack = build(registry.ATTACK, "dia", {})
+    defense: Defense = build(discovery.DEFENSE, "none", {})
+    attack: Attack = build(discovery.ATTACK, "dia", {})
     return tuple(
         Row(name=name, labels={"row": name}, paper={"ssim": ssim}, defense=defense, attack=attack, task=Reconstruction())
         for name, ssim in PAPER.items()
@@ -254,18 +257,18 @@ def test_what_fails_or_does_not_apply_is_said_in_every_form() -> None:
     rebuilt = made_up({"raw": [None, *around(0.6, 7)], "two": around(0.3), "four": around(0.4), "none": []})
     assert rebuilt.notes == {"raw": "1 failed; small", "two": "small", "four": "small", "none": "n/a: no network"}
     assert run.failures(rebuilt.ran) == 1
-    written = report.markdown(rebuilt)
+    written = page.markdown(rebuilt)
     assert "does not hold: [two] ssim > [four] ssim: paper 0.1, ours -0.1 [-0.1, -0.1]" in written
     assert "cannot tell: [raw] ssim > [none] ssim: paper 0.6, nothing measured (none: n/a: no network)" in written
     assert "(Of 6: 2 hold, 1 do not hold, 3 cannot be told.)" in written
-    shown = report.side_by_side(rebuilt)
+    shown = page.side_by_side(rebuilt)
     assert list(shown["n"]) == ["7", "8", "8", "0"]
     assert shown["ssim, ours"].iloc[3] == "n/a"
     assert "0.605" in shown["ssim, ours"].iloc[1] or "0.305" in shown["ssim, ours"].iloc[1]
-    plain = report.plain(rebuilt)
+    plain = page.plain(rebuilt)
     assert json.loads(json.dumps(plain, allow_nan=False)) == plain
     assert [claim["verdict"] for claim in plain["claims"]] == ["does not hold", "does not hold"]
-    numbers = report.numbers(rebuilt).set_index(["row", "measure"])
+    numbers = page.numbers(rebuilt).set_index(["row", "measure"])
     assert pd.isna(numbers.loc[("none", "ssim"), "ours"])
     assert numbers.loc[("two", "ssim"), "photographs"] == 8
 
@@ -286,11 +289,11 @@ def test_a_median_takes_a_unit_without_a_value_for_the_worst() -> None:
     assert rebuilt.ours["raw", "mean"].mean == 1.5
     assert rebuilt.ours["raw", "mean"].count == 2
     assert rebuilt.ours["raw", "median"].mean == float("inf")
-    shown = report.side_by_side(rebuilt).iloc[0]
+    shown = page.side_by_side(rebuilt).iloc[0]
     assert shown["median"] == "∞"
     assert shown["n"] == "2/5"
-    assert "seeds 0 to 5" in report.heading(rebuilt)
-    assert json.loads(json.dumps(report.plain(rebuilt), allow_nan=False))["rows"][0]["ours"]["median"]["ours"] == "inf"
+    assert "seeds 0 to 5" in page.heading(rebuilt)
+    assert json.loads(json.dumps(page.plain(rebuilt), allow_nan=False))["rows"][0]["ours"]["median"]["ours"] == "inf"
 
 
 def test_the_order_of_the_paper_is_confirmed_where_it_is_there() -> None:

@@ -10,10 +10,11 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from bench.features.sift import Sift
-from bench.kernels.subset import log10_chance
-from bench.public import Public
+from bench.codebook.public import Public
+from bench.extractors.sift import Sift
+from bench.mechanisms.subset import log10_chance
 from defenses.ldp import LDP
+from leaderboard.intervals import RESAMPLES, independent, interval, rank_correlation
 from leaderboard.reproduce import scale, tables
 from leaderboard.reproduce.claims import (
     FEWEST,
@@ -27,7 +28,6 @@ from leaderboard.reproduce.claims import (
     judge,
     same_order,
 )
-from leaderboard.reproduce.intervals import RESAMPLES, independent, interval, rank_correlation
 from leaderboard.reproduce.profiles import CPU, PROFILES, Materials, Setting
 from leaderboard.reproduce.study import printed
 from leaderboard.reproduce.tables import table2, table3, table4

@@ -20,14 +20,17 @@ from fakes import FAKES, album, install
 from PIL import Image
 
 from attacks.repeat import Repeat
-from bench import cache, composition, engines, rundir, runner
+from bench.api import Asset, Attack, Defense, Task, View
+from bench.cache import store
+from bench.core.errors import UserError
 from bench.datasets.gallery import Gallery
-from bench.errors import UserError
-from bench.plugin import Asset, Attack, Defense, Task, View
-from bench.records import FILE, Record
+from bench.mechanisms import composition
+from bench.runner import directory, engines
+from bench.runner import plan as runner
+from bench.runner.records import FILE, Record
+from bench.runner.trial import Trials
 from bench.tasks.reconstruction import Reconstruction
 from bench.testing import small_dictionary
-from bench.trials import Trials
 from bench.types import Knowledge
 from defenses.affine import Affine
 from defenses.ldp import LDP
@@ -106,7 +109,7 @@ def test_recovered_descriptors_are_scored_and_painted(images: Path, small: Asset
 
 
 def test_descriptors_are_scored_where_nothing_can_paint_them(images: Path, small: Asset) -> None:
-    from bench.features.sift import Sift
+    from bench.extractors.sift import Sift
 
     few = Sift(max_keypoints=77)  # no network for it is shipped
     record = run([LDP(dictionary=small)], [Guess()], images, Reconstruction(), extractor=few)[0]
@@ -293,7 +296,7 @@ def test_finished_run_is_not_done_again(images: Path, small: Asset, tmp_path: Pa
     assert run(*grid, out=tmp_path / "out") == first
     assert (tmp_path / "out" / FILE).read_bytes() == before
     for record in first:
-        assert rundir.picture(tmp_path / "out", record).is_file() == (record["status"] == "ok")
+        assert directory.picture(tmp_path / "out", record).is_file() == (record["status"] == "ok")
 
 
 def test_interrupted_run_goes_on_and_ends_as_if_it_had_not_been(images: Path, small: Asset, tmp_path: Path) -> None:
@@ -410,7 +413,7 @@ def test_selected_keypoints_alone_are_scored_and_painted(images: Path, monkeypat
 
 
 def test_foreground_and_background_are_told_apart_in_a_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(cache.VARIABLE, str(tmp_path / "cache"))
+    monkeypatch.setenv(store.VARIABLE, str(tmp_path / "cache"))
     place = Gallery(views=1, queries=1, night=0, width=160, height=128, detail=0.2, people=4)
     (record,) = runner.run([Undefended()], [Painter()], task=PAINT, dataset=place)
     mask = place.scene().queries[0].pixels.foreground()

@@ -8,8 +8,8 @@ import pytest
 import torch
 from floor import bare_product
 
-from bench.kernels import search
-from bench.kernels.search import WordIndex, unit_rows
+from bench.geometry import nearest_words
+from bench.geometry.nearest_words import WordIndex, unit_rows
 
 
 def nearest_rows(queries: np.ndarray, words: np.ndarray) -> np.ndarray:
@@ -51,11 +51,11 @@ def test_without_a_margin_it_would_be_wrong(rng, monkeypatch):
     """Negative control of the tests above: the first pass alone does not decide."""
     base = rng.integers(0, 120, 128)
     words, queries = (
-        np.clip(base + rng.integers(-60, 61, (count, 128)), 0, 255).astype(np.uint8) for count in (3 * search.BLOCK, 4000)
+        np.clip(base + rng.integers(-60, 61, (count, 128)), 0, 255).astype(np.uint8) for count in (3 * nearest_words.BLOCK, 4000)
     )
     assert np.array_equal(nearest_rows(queries, words), brute_force(queries, words))
-    monkeypatch.setattr(search, "margin", lambda best, errors, dtype: torch.zeros_like(best))
-    monkeypatch.setattr(search, "pick_dtype", lambda device: torch.bfloat16)
+    monkeypatch.setattr(nearest_words, "margin", lambda best, errors, dtype: torch.zeros_like(best))
+    monkeypatch.setattr(nearest_words, "pick_dtype", lambda device: torch.bfloat16)
     assert not np.array_equal(nearest_rows(queries, words), brute_force(queries, words))
 
 

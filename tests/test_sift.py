@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from bench.datasets import photographs
-from bench.errors import UnitError, UserError
-from bench.features.sift import Sift
+from bench.core.errors import UnitError, UserError
+from bench.extractors.sift import Sift
+from bench.images import photographs
 
 
 @pytest.fixture(scope="module")

@@ -9,10 +9,10 @@ import fabricated
 import pytest
 from fabricated import DIA, ENVIRONMENT, PHOTOGRAPHS, SETTINGS, inapplicable, ldp, localizations, paint, reconstructions
 
-from bench.records import cell_id
-from bench.rundir import picture
+from bench.runner.directory import picture
+from bench.runner.records import cell_id
 from leaderboard import site
-from leaderboard.report import photograph
+from leaderboard.run_report import photograph
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 

@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 from PIL import Image, ImageDraw
 
-from bench import cli, registry, skeleton
+from bench import cli
+from bench.registry import discovery, scaffold
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -21,7 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.plugin import Defense, Privacy
+from bench.api import Defense, Privacy
 from bench.types import Subspaces
 
 
@@ -63,9 +64,9 @@ def dots(count: int) -> Image.Image:
 
 
 def test_contract_tests_of_all_kinds_pass(tmp_path: Path) -> None:
-    for kind in skeleton.KINDS:
+    for kind in scaffold.KINDS:
         assert cli.main(["new", kind, f"my-{kind}", "--out", str(tmp_path / kind)]) == 0
-    folders = [tmp_path / kind for kind in skeleton.KINDS]
+    folders = [tmp_path / kind for kind in scaffold.KINDS]
     tests = [str(folder / "tests") for folder in folders]
     done = outside("-m", "pytest", "-q", "-p", "no:cacheprovider", *tests, path=folders, cwd=tmp_path)
     assert done.returncode == 0, done.stdout[-3000:]
@@ -100,13 +101,13 @@ def test_installed_packages_run_against_every_attack(tmp_path: Path) -> None:
     pip = ["-m", "pip", "install", "-q", "--no-build-isolation", "--no-deps", "--no-index", "--target", str(site)]
     done = outside(*pip, str(tmp_path / "my-defense"), str(tmp_path / "planes"), path=[], cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    attacks = [option for attack in registry.discover(registry.ATTACK) for option in ("--attack", attack)]
+    attacks = [option for attack in discovery.discover(discovery.ATTACK) for option in ("--attack", attack)]
     defenses = ["--defense", "my-defense:levels=4", "--defense", "planes"]
     results = ["--images", "album", "--out", "x"]
     done = outside("-m", "bench.cli", "run", *defenses, *attacks, *results, path=[site], cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     records = [json.loads(line) for line in (tmp_path / "x" / "records.jsonl").read_text().splitlines()]
-    assert len(records) == 2 * len(registry.discover(registry.ATTACK))
+    assert len(records) == 2 * len(discovery.discover(discovery.ATTACK))
     ran = {(record["defense"]["name"], record["attack"]["name"]) for record in records if record["status"] == "ok"}
     assert {("my-defense", "keypoints"), ("planes", "keypoints"), ("planes", "nearest"), ("planes", "sparsity")} <= ran
     assert all(record["reason"] for record in records if record["status"] == "n/a")

@@ -9,11 +9,11 @@ from lifted import centres, errors, features, lifted, sift, turned, view
 from scipy.optimize import linprog
 
 from attacks.sparsity import Sparsity
-from bench.errors import UserError
-from bench.features.sift import Sift
-from bench.kernels.subspaces import guesses
-from bench.kernels.vertices import unit_vertices
-from bench.public import Public
+from bench.codebook.public import Public
+from bench.core.errors import UserError
+from bench.extractors.sift import Sift
+from bench.geometry.subspaces import guesses
+from bench.geometry.vertices import unit_vertices
 from bench.types import Subspaces
 from defenses.affine import Affine
 

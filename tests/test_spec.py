@@ -5,18 +5,18 @@ from pathlib import Path
 
 import pytest
 
-from bench import registry, spec
-from bench.errors import UserError
-from bench.features.sift import Sift
-from bench.plugin import Asset
-from bench.public import Public
+from bench.api import Asset
+from bench.codebook.public import Public
+from bench.core.errors import UserError
+from bench.extractors.sift import Sift
+from bench.registry import discovery, spec
 from bench.testing import small_dictionary
 from defenses.affine import Affine
 from defenses.ldp import LDP
 
 
 def test_fields_are_read_by_their_types() -> None:
-    plugin, given = spec.parse("ldp:epsilon=12,subset_size=4", registry.DEFENSE)
+    plugin, given = spec.parse("ldp:epsilon=12,subset_size=4", discovery.DEFENSE)
     assert plugin is LDP
     assert given == {"epsilon": 12.0, "subset_size": 4}
     assert isinstance(given["epsilon"], float)
@@ -25,15 +25,15 @@ def test_fields_are_read_by_their_types() -> None:
 
 @pytest.mark.parametrize("text", ["ldp", "ldp:", " ldp : "])
 def test_no_fields_means_defaults(text: str) -> None:
-    assert spec.parse(text.strip(), registry.DEFENSE)[0] is LDP
-    assert spec.read("ldp", registry.DEFENSE) == LDP()
+    assert spec.parse(text.strip(), discovery.DEFENSE)[0] is LDP
+    assert spec.read("ldp", discovery.DEFENSE) == LDP()
 
 
 def test_infinity_truth_choices_and_paths() -> None:
-    assert spec.read("ldp:epsilon=inf,subset_size=1", registry.DEFENSE) == LDP(epsilon=math.inf, subset_size=1)
-    assert spec.read("sift:upright=false", registry.EXTRACTOR) == Sift(upright=False)
-    assert spec.read("affine:lifting=random", registry.DEFENSE) == Affine(lifting="random")
-    assert spec.read("ldp:dictionary=/a/b=c.safetensors", registry.DEFENSE) == LDP(dictionary=Asset("/a/b=c.safetensors"))
+    assert spec.read("ldp:epsilon=inf,subset_size=1", discovery.DEFENSE) == LDP(epsilon=math.inf, subset_size=1)
+    assert spec.read("sift:upright=false", discovery.EXTRACTOR) == Sift(upright=False)
+    assert spec.read("affine:lifting=random", discovery.DEFENSE) == Affine(lifting="random")
+    assert spec.read("ldp:dictionary=/a/b=c.safetensors", discovery.DEFENSE) == LDP(dictionary=Asset("/a/b=c.safetensors"))
 
 
 @pytest.mark.parametrize(
@@ -61,17 +61,17 @@ def test_infinity_truth_choices_and_paths() -> None:
 )
 def test_mistakes_are_explained(text: str, complaint: str) -> None:
     with pytest.raises(UserError, match=complaint):
-        spec.read(text, registry.DEFENSE)
+        spec.read(text, discovery.DEFENSE)
 
 
 def test_truth_is_true_or_false() -> None:
     with pytest.raises(UserError, match="upright must be true or false, not '1'"):
-        spec.read("sift:upright=1", registry.EXTRACTOR)
+        spec.read("sift:upright=1", discovery.EXTRACTOR)
 
 
 def test_field_without_default_must_be_given() -> None:
     with pytest.raises(UserError, match=r"hloc needs path \(a path\): write hloc:path="):
-        spec.read("hloc", registry.EXTRACTOR)
+        spec.read("hloc", discovery.EXTRACTOR)
 
 
 def test_configuration_holds_the_content_of_files(tmp_path: Path) -> None:
@@ -97,8 +97,8 @@ def test_configuration_knows_no_infinity_and_one_way_of_writing_a_number(tmp_pat
 @pytest.mark.parametrize(("text", "written"), [("21/2", 10.5), ("0.1", 0.1), ("1/3", "1/3"), ("10", 10.0), ("inf", "inf")])
 def test_a_fraction_is_kept(text: str, written: float | str) -> None:
     """And written so that two configurations which differ are two in the records, too."""
-    assert spec.written(spec.read(f"ldp:epsilon={text}", registry.DEFENSE))["epsilon"] == written
-    assert spec.written(spec.read("ldp:epsilon=0.3333333333333333", registry.DEFENSE))["epsilon"] != "1/3"
+    assert spec.written(spec.read(f"ldp:epsilon={text}", discovery.DEFENSE))["epsilon"] == written
+    assert spec.written(spec.read("ldp:epsilon=0.3333333333333333", discovery.DEFENSE))["epsilon"] != "1/3"
 
 
 def test_what_is_resolved_elsewhere_stands_in_the_place_of_an_asset() -> None:

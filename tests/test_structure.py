@@ -11,15 +11,15 @@ import pytest
 from fakes import scene, trial
 from scipy.spatial.transform import Rotation
 
+from bench.api import Asset, Dataset, Defense, Outcome
+from bench.codebook.public import Public
+from bench.core.errors import UserError
 from bench.datasets.gallery import Gallery
-from bench.datasets.scene import File, Scene, SceneImage
 from bench.datasets.walk import Walk
-from bench.errors import UserError
-from bench.plugin import Asset, Dataset, Defense, Outcome
-from bench.public import Public
-from bench.structure import agreement, consistency, mapping, picture, verification
-from bench.structure.mapping import Mapper, Model
-from bench.structure.verification import Pair
+from bench.images.scene import File, Scene, SceneImage
+from bench.sfm import agreement, consistency, incremental_mapping, picture, verification
+from bench.sfm.incremental_mapping import Mapper, Model
+from bench.sfm.verification import Pair
 from bench.tasks.structure import Structure, measured
 from bench.testing import example_features, shot, small_dictionary
 from bench.types import Features, Indices
@@ -141,15 +141,15 @@ def test_shuffled_matches_have_no_geometry(keypoints: list[np.ndarray], matches:
     """Negative control."""
     found = verification.verified(CAMERA, keypoints, shuffled(matches), 0)
     assert len(found) <= 2
-    assert mapping.mapped(CAMERA, keypoints, found, "global", 0) is None
+    assert incremental_mapping.mapped(CAMERA, keypoints, found, "global", 0) is None
 
 
 @pytest.mark.parametrize("mapper", ["global", "incremental"])
 def test_the_mapped_cameras_are_the_true_ones(
     mapper: Mapper, geometries: dict[Pair, verification.Geometry], keypoints: list[np.ndarray], poses: list[pycolmap.Rigid3d]
 ) -> None:
-    model = mapping.mapped(CAMERA, keypoints, geometries, mapper, 0)
-    again = mapping.mapped(CAMERA, keypoints, geometries, mapper, 0)
+    model = incremental_mapping.mapped(CAMERA, keypoints, geometries, mapper, 0)
+    again = incremental_mapping.mapped(CAMERA, keypoints, geometries, mapper, 0)
     assert model is not None
     assert again is not None
     assert len(model.images) == VIEWS == agreement.right(model, poses)

@@ -14,13 +14,14 @@ from fake_plugins.peeker import Peeker
 from fakes import album, install, scene
 
 import bench
-from bench import cli, records
-from bench.features.sift import Sift
-from bench.isolation import isolated
+from bench import cli
+from bench.api import View
+from bench.codebook.public import Public
+from bench.extractors.sift import Sift
+from bench.localization.scene_index import Place
 from bench.localization.server import Server
-from bench.place import Place
-from bench.plugin import View
-from bench.public import Public
+from bench.runner import records
+from bench.runner.attack_process import isolated
 from bench.tasks.reconstruction import Reconstruction
 from bench.testing import small_dictionary
 from bench.types import Knowledge, Subspaces

@@ -8,12 +8,12 @@ import pytest
 import torch
 from floor import bare_product
 
-from bench.datasets import photographs
-from bench.features.sift import Sift
-from bench.kernels import subspaces
-from bench.kernels.search import unit_rows
-from bench.kernels.subspaces import feet_and_frames, nearest_to_subspaces, project
-from bench.public import Public
+from bench.codebook.public import Public
+from bench.extractors.sift import Sift
+from bench.geometry import subspaces
+from bench.geometry.nearest_words import unit_rows
+from bench.geometry.subspaces import feet_and_frames, nearest_to_subspaces, project
+from bench.images import photographs
 from bench.types import Subspaces
 from defenses.affine import Affine, lift, reparameterise
 

@@ -17,14 +17,17 @@ from fake_plugins.painter import Painter
 from fakes import FAKES, album, install
 
 from attacks.dia import DIA
-from bench import cli, engines, rundir, runner, suite, threads
+from bench import cli
+from bench.api import Asset
+from bench.core import threads
+from bench.core.errors import UserError
 from bench.datasets.gallery import Gallery
-from bench.errors import UserError
-from bench.plugin import Asset
-from bench.records import FILE, Log, Record
-from bench.runner import Plan
-from bench.status import Count, status
-from bench.suite import Suite, grid
+from bench.runner import directory, engines, suite
+from bench.runner import plan as runner
+from bench.runner.plan import Plan
+from bench.runner.records import FILE, Log, Record
+from bench.runner.status import Count, status
+from bench.runner.suite import Suite, grid
 from bench.tasks.reconstruction import Reconstruction
 from bench.testing import small_dictionary
 from defenses.affine import Affine
@@ -34,7 +37,7 @@ from defenses.none import Undefended
 PAINT = Reconstruction(inverter="painter")
 MINE = """
 from fake_plugins.painter import Painter
-from bench.suite import Suite, grid
+from bench.runner.suite import Suite, grid
 from bench.tasks.reconstruction import Reconstruction
 from defenses.none import Undefended
 
@@ -256,7 +259,7 @@ def test_a_worker_with_other_files_is_refused(images: Path, tmp_path: Path, clus
 
 def test_a_scheduler_that_is_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed", reason="needs dask.distributed: pip install distributed")
-    from bench.engines import cluster as module
+    from bench.runner.engines import cluster as module
 
     monkeypatch.setattr(module, "PATIENCE", 0.2)
     with pytest.raises(UserError, match="no scheduler answers there"):
@@ -324,7 +327,7 @@ list(runner.execute([plan], Path("out")))
     assert dead.writer is not None
     assert dead.writer["pid"] == process.pid
     assert len(list(runner.execute([plan], out))) == 10  # the lock is gone with its owner
-    assert not (out / rundir.RUNNING).exists()
+    assert not (out / directory.RUNNING).exists()
 
 
 def test_failed_units_and_records_of_other_runs_are_told_apart(

@@ -4,17 +4,17 @@ import numpy as np
 import pytest
 import torch
 
-from attacks.inversion import weights
-from attacks.inversion.data import Examples
-from attacks.inversion.loss import ssim
-from attacks.inversion.network import Inverter, Shape
-from attacks.inversion.painting import painted
-from attacks.inversion.symmetry import IDENTITY, OF_POSITIONS, Symmetry, symmetries
-from bench.datasets import photographs
-from bench.features.sift import Sift
-from bench.features.views import PhotographView
-from bench.plugin import Extractor
-from bench.public import ASSETS, Public
+from bench.api import Extractor
+from bench.codebook.public import ASSETS, Public
+from bench.extractors.sift import Sift
+from bench.images import photographs
+from bench.images.views import PhotographView
+from bench.inversion import weights
+from bench.inversion.data import Examples
+from bench.inversion.loss import ssim
+from bench.inversion.network import Inverter, Shape
+from bench.inversion.reconstruct import painted
+from bench.inversion.symmetry import IDENTITY, OF_POSITIONS, Symmetry, symmetries
 from bench.types import Descriptors, Subspaces, WordSets
 from defenses.none import Undefended
 

@@ -8,13 +8,13 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch import distributed, nn
 
-import attacks.inversion.train as inversion
-from attacks.inversion import learner, norm, painting, weights
-from attacks.inversion.plan import PROFILES, Plan, Training
-from attacks.inversion.team import Team, launch
+import bench.inversion.train as inversion
 from bench.cli import main
-from bench.datasets import photographs
-from bench.features.sift import Sift
+from bench.extractors.sift import Sift
+from bench.images import photographs
+from bench.inversion import learner, norm, reconstruct, weights
+from bench.inversion.plan import PROFILES, Plan, Training
+from bench.inversion.process_group import Team, launch
 from defenses.none import Undefended
 
 pytestmark = pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="two processes need two cores")
@@ -67,12 +67,12 @@ def losses(folder):
 
 def in_single_precision(*given):
     """Train and paint without half-precision's rounding, which grows from step to step."""
-    learner.pick_dtype = painting.pick_dtype = lambda device: torch.float32
+    learner.pick_dtype = reconstruct.pick_dtype = lambda device: torch.float32
     return inversion.take_part(*given)
 
 
 def put_back(monkeypatch):
-    for module in (learner, painting):
+    for module in (learner, reconstruct):
         monkeypatch.setattr(module, "pick_dtype", module.pick_dtype)
 
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from fabricated import DIA, ENVIRONMENT, GALLERY, PHOTOGRAPHS, inapplicable, ldp, localizations, reconstructions, record
 
-from leaderboard import boards, plots
-from leaderboard.boards import Board
-from leaderboard.marks import MARKS, marks, place_labels
+from leaderboard import comparison, plots
+from leaderboard.comparison import Board
+from leaderboard.plot_style import MARKS, marks, place_labels
 from leaderboard.site.chart import charts
 from leaderboard.tradeoff import Tradeoff, pareto, tradeoffs
 
@@ -19,7 +19,7 @@ DAYS = ["day", "day", "night", "night"]
 
 
 def joined(tmp_path: Path, *groups: list[dict[str, Any]]) -> list[Tradeoff]:
-    found = boards.boards(boards.find(fabricated.write(tmp_path, [record for group in groups for record in group])))
+    found = comparison.boards(comparison.find(fabricated.write(tmp_path, [record for group in groups for record in group])))
     attacked: Board = next(board for board in found if board.attacked)
     return tradeoffs(attacked, found)
 
@@ -177,7 +177,7 @@ def test_plots_are_drawn_of_what_there_is(tmp_path: Path) -> None:
         *localizations(NONE, [1, 1], [None, None]),
         *localizations(ldp(8.0), [1, 0], [None, None]),
     ]
-    found = boards.boards(boards.find(fabricated.write(tmp_path, records)))
+    found = comparison.boards(comparison.find(fabricated.write(tmp_path, records)))
     drawn = dict(plots.plots(found[0], tradeoffs(found[0], found)))
     assert list(drawn) == ["attacks", "epsilon", "tradeoff"]
     (axes,) = drawn["tradeoff"].axes

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from fakes import scene, texture
 
-from bench import cache, units
+from bench.cache import feature_cache, store
+from bench.codebook.public import Public
+from bench.core.errors import UserError
 from bench.datasets.gallery import Gallery
-from bench.datasets.scene import Pixels, Scene
-from bench.errors import UserError
-from bench.features import kept
-from bench.features.sift import Sift
-from bench.place import Place
-from bench.public import Public
+from bench.extractors.sift import Sift
+from bench.images import samples
+from bench.images.scene import Pixels, Scene
+from bench.localization.scene_index import Place
 from bench.tasks.collisions import Collisions
 from bench.testing import same
 
@@ -23,14 +23,14 @@ TINY = Gallery(views=2, queries=3, width=64, height=48, detail=0.1)
 
 @pytest.fixture(autouse=True)
 def _cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(cache.VARIABLE, str(tmp_path / "cache"))
+    monkeypatch.setenv(store.VARIABLE, str(tmp_path / "cache"))
 
 
 def test_queries_are_units_with_their_condition_and_the_whole_scene_counts() -> None:
-    collection = units.of_queries(TINY)
+    collection = samples.of_queries(TINY)
     assert [unit.condition for unit in collection.units] == ["day", "day", "night"]
     assert len({unit.content_hash() for unit in collection.units}) == 3
-    other = units.of_queries(dataclasses.replace(TINY, views=3))  # another map, and so another dataset
+    other = samples.of_queries(dataclasses.replace(TINY, views=3))  # another map, and so another dataset
     assert collection.beside != other.beside
 
 
@@ -55,16 +55,16 @@ class Counted(Pixels):
 
 def test_features_are_kept_by_content_and_made_again_when_damaged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     image, extractor = Counted(1), Sift()
-    first = kept.features(extractor, image)
+    first = feature_cache.features(extractor, image)
     assert same(first, extractor.extract(np.array(texture(1))))
-    assert same(first, kept.features(extractor, image))
+    assert same(first, feature_cache.features(extractor, image))
     assert image.reads == 1
-    assert len(kept.features(Sift(max_keypoints=3), image)) <= 3  # another extractor
-    assert not same(first, kept.features(extractor, Counted(2)))  # another image
+    assert len(feature_cache.features(Sift(max_keypoints=3), image)) <= 3  # another extractor
+    assert not same(first, feature_cache.features(extractor, Counted(2)))  # another image
     assert image.reads == 2
     for file in (tmp_path / "cache").rglob("*.safetensors"):
         file.write_bytes(file.read_bytes()[:-9])
-    assert same(first, kept.features(extractor, image))
+    assert same(first, feature_cache.features(extractor, image))
     assert image.reads == 3
     assert "made again" in caplog.text
 
@@ -102,4 +102,4 @@ def test_a_scene_without_queries_is_a_mistake(tmp_path: Path, monkeypatch: pytes
     bare: Scene = dataclasses.replace(scene(tmp_path / "scene"), queries=())
     monkeypatch.setattr(Gallery, "scene", lambda self: bare)
     with pytest.raises(UserError, match="has no queries"):
-        units.of_queries(TINY)
+        samples.of_queries(TINY)

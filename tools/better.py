@@ -21,23 +21,23 @@ from make_assets import part
 
 import bench
 from attacks.dia import DIA
-from attacks.inversion import weights
-from attacks.inversion.plan import Plan, Training
-from attacks.inversion.train import train
 from attacks.keypoints import Keypoints
 from attacks.repeat import Repeat
-from bench import registry, spec
+from bench.api import Asset, Attack, Between, Dataset, Defense, OneOf
+from bench.codebook.public import ASSETS
 from bench.datasets.gallery import Gallery
-from bench.datasets.photographs import folder
-from bench.datasets.scene import Scene
-from bench.features.sift import Sift
-from bench.plugin import Asset, Attack, Between, Dataset, Defense, OneOf
-from bench.public import ASSETS
-from bench.records import Record
+from bench.extractors.sift import Sift
+from bench.images.photographs import folder
+from bench.images.scene import Scene
+from bench.inversion import weights
+from bench.inversion.plan import Plan, Training
+from bench.inversion.train import train
+from bench.registry import discovery, spec
+from bench.runner.records import Record
 from bench.tasks.localization import Localization
 from defenses.none import Undefended
 from defenses.privunit import expected_cosine
-from leaderboard.reproduce.intervals import Interval, interval, proportion
+from leaderboard.intervals import Interval, interval, proportion
 from leaderboard.tables import markdown_row
 
 PAGE = Path(__file__).parents[1] / "docs" / "better.md"
@@ -140,7 +140,7 @@ class Study:
         given = "" if name == "privunit" else f":words={WORDS}"
         print(f"network for {name}", flush=True)
         plan = Plan(
-            defense=spec.read(name + given, registry.DEFENSE),
+            defense=spec.read(name + given, discovery.DEFENSE),
             served=SERVED[name],
             photographs=self.photographs,
             validation=self.validation,
@@ -185,7 +185,7 @@ class Study:
 
 
 def _read(text: str, dictionary: str = "") -> Defense:
-    return spec.read(f"{text},dictionary={dictionary}" if dictionary else text, registry.DEFENSE)
+    return spec.read(f"{text},dictionary={dictionary}" if dictionary else text, discovery.DEFENSE)
 
 
 def page(study: Study, networks: Mapping[str, Path]) -> list[str]:

@@ -22,18 +22,28 @@ from typing import Any
 
 import numpy as np
 
-from bench import cache, fields, provenance, registry, runner, spec
-from bench.datasets import gallery, photographs
-from bench.errors import UnitError, UserError
-from bench.plugin import Task
-from bench.runner import Asked
-from bench.trials import Trials
+from bench.api import Task
+from bench.cache import provenance, store
+from bench.core.errors import UnitError
+from bench.datasets import gallery
+from bench.images import photographs
+from bench.registry import discovery, spec
+from bench.runner import plan as runner
+from bench.runner.plan import Asked
+from bench.runner.trial import Trials
 from bench.types import Release
 
 TOLERANCE = 1e-6
 DEFENSES = (
     *("none", "affine", "affine:dim=2", "affine:lifting=random,dim=4", "affine:lifting=adversarial,dim=8"),
-    *("ldp", "ldp:epsilon=16", "ldp:epsilon=6.534,words=8000", "ldp:epsilon=12,subset_size=4", "naive-ldp", "naive-ldp:epsilon=40"),
+    *(
+        "ldp",
+        "ldp:epsilon=16",
+        "ldp:epsilon=6.534,words=8000",
+        "ldp:epsilon=12,subset_size=4",
+        "naive-ldp",
+        "naive-ldp:epsilon=40",
+    ),
     *("plateau", "exponential", "privunit", "metric-ldp"),
 )
 # Fewer releases of other users and fewer neighbours than by default, which change the seconds and not the code that runs.
@@ -41,7 +51,7 @@ ATTACKS = {
     "clustering": "clustering:others=3,neighbours=64",
     "intersection": "intersection:others=3,neighbours=64",
 }
-SCENE = "gallery:views=10,queries=2,width=320,height=240,rooms=1,people=0.5"
+SCENE = "gallery:views=60,queries=2,width=320,height=240,rooms=1,people=0.5"
 WALK = "walk:views=4,others=6,width=320,height=240"
 FEW = "sift:max_keypoints=300"
 
@@ -60,9 +70,11 @@ class Case:
 
 
 def cases() -> Iterator[Case]:
-    every = tuple(ATTACKS.get(plugin.name(), plugin.name()) for plugin in registry.everything(registry.ATTACK))
+    every = tuple(ATTACKS.get(plugin.name(), plugin.name()) for plugin in discovery.everything(discovery.ATTACK))
     yield Case("reconstruction", DEFENSES, every, photographs=("rocket", "coffee"))
-    yield Case("reconstruction", ("none", "ldp", "affine"), ("dia", "keypoints"), "sift:upright=false", photographs=("rocket", "coffee"))
+    yield Case(
+        "reconstruction", ("none", "ldp", "affine"), ("dia", "keypoints"), "sift:upright=false", photographs=("rocket", "coffee")
+    )
     yield Case("reconstruction", ("none", "affine", "ldp:epsilon=16"), ("inlier", "dia"), FEW, SCENE, samples=2)
     yield Case("matching:each=1", DEFENSES, samples=1)
     yield Case("matching:each=1,both=true,ratio=0.9", ("none", "affine", "ldp:epsilon=16"), samples=1)
@@ -115,16 +127,16 @@ def measured(case: Case) -> Iterator[dict[str, Any]]:
 
 def planned(case: Case) -> Any:
     sources = [source for source in photographs.builtin() if case.photographs is not None and source.name in case.photographs]
-    task: Task = spec.read(case.task, registry.TASK)
-    attacks = [None if text is None else spec.read(text, registry.ATTACK) for text in case.attacks]
-    pairs = [(spec.read(text, registry.DEFENSE), attack) for text in case.defenses for attack in attacks]
+    task: Task = spec.read(case.task, discovery.TASK)
+    attacks = [None if text is None else spec.read(text, discovery.ATTACK) for text in case.attacks]
+    pairs = [(spec.read(text, discovery.DEFENSE), attack) for text in case.defenses for attack in attacks]
     return runner.planned(
         Asked(
             pairs=tuple(pairs),
             images=sources or None,
             task=task,
-            extractor=spec.read(case.extractor, registry.EXTRACTOR),
-            dataset=None if case.dataset is None else spec.read(case.dataset, registry.DATASET),
+            extractor=spec.read(case.extractor, discovery.EXTRACTOR),
+            dataset=None if case.dataset is None else spec.read(case.dataset, discovery.DATASET),
             seed=5,
         )
     )
@@ -177,7 +189,7 @@ def main() -> int:
     options = parser.parse_args()
     provenance.source = lambda *modules: "sha256:constant"
     gallery._renderer = lambda: "constant"
-    with tempfile.TemporaryDirectory() as folder, cache.within(Path(folder)):
+    with tempfile.TemporaryDirectory() as folder, store.within(Path(folder)):
         if options.what == "write":
             with options.file.open("w") as file:
                 write(file)

@@ -28,22 +28,22 @@ from make_assets import part
 from perceived import classifiers, unlike, vgg_file, vggs
 from torch import Tensor, nn
 
-from attacks.inversion import weights
-from attacks.inversion.data import Example, Examples
-from attacks.inversion.encoding import CELL, Points
-from attacks.inversion.learner import Learner
-from attacks.inversion.loss import LUMA, WEIGHT, ssim
-from attacks.inversion.network import Inverter, Shape
-from attacks.inversion.painting import painted
-from attacks.inversion.plan import Training
-from attacks.inversion.symmetry import IDENTITY, Symmetry, symmetries
-from attacks.inversion.train import scored, to_batch, validate
-from bench.datasets.photographs import folder
-from bench.errors import UserError
-from bench.features.sift import Sift
-from bench.features.views import PhotographView, collect
-from bench.progress import Progress
-from bench.public import Public
+from bench.codebook.public import Public
+from bench.core.errors import UserError
+from bench.core.progress import Progress
+from bench.extractors.sift import Sift
+from bench.images.photographs import folder
+from bench.images.views import PhotographView, collect
+from bench.inversion import weights
+from bench.inversion.data import Example, Examples
+from bench.inversion.encoding import CELL, Points
+from bench.inversion.learner import Learner
+from bench.inversion.loss import LUMA, WEIGHT, ssim
+from bench.inversion.network import Inverter, Shape
+from bench.inversion.plan import Training
+from bench.inversion.reconstruct import painted
+from bench.inversion.symmetry import IDENTITY, Symmetry, symmetries
+from bench.inversion.train import scored, to_batch, validate
 from bench.types import Descriptors
 from defenses.none import Undefended
 from leaderboard.tables import markdown_row

@@ -23,9 +23,9 @@ from make_assets import part, run
 
 import bench
 from attacks.dia import DIA
-from bench import registry, spec
-from bench.plugin import Asset
-from leaderboard.reproduce.intervals import Interval, interval
+from bench.api import Asset
+from bench.registry import discovery, spec
+from leaderboard.intervals import Interval, interval
 from leaderboard.tables import markdown_row
 
 PAGE = Path(__file__).parents[1] / "docs" / "leakage.md"
@@ -73,10 +73,10 @@ class Study:
         for where, images in self.photographs.items():
             print(network.name, where, flush=True)
             records = bench.run(
-                [spec.read(defense, registry.DEFENSE) for defense in defenses],
+                [spec.read(defense, discovery.DEFENSE) for defense in defenses],
                 [DIA(weights=Asset(network))],
                 images,
-                extractor=spec.read(extractor, registry.EXTRACTOR),
+                extractor=spec.read(extractor, discovery.EXTRACTOR),
                 out=self.work / "records",
             )
             for place, scores in enumerate(found):

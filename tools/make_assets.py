@@ -13,7 +13,7 @@ import shutil
 from pathlib import Path
 
 from bench.cli import main as bench
-from bench.public import ASSETS
+from bench.codebook.public import ASSETS
 
 WORDS, PUBLIC_WORDS = 256_000, 128_000
 DEFENSES = ("none", "affine", "ldp")

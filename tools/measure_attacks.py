@@ -25,19 +25,19 @@ import numpy as np
 import bench
 from attacks.lattice import Lattice
 from attacks.sparsity import Sparsity
-from bench import registry, spec
-from bench.datasets import photographs
-from bench.features import dictionary
-from bench.features.sift import Sift
-from bench.kernels.lattice import unit_integer_points
-from bench.plugin import Asset, Attack, Defense, DescriptorAttack, ImageAttack, View
-from bench.population import Population
-from bench.progress import Progress
-from bench.public import Public
-from bench.records import Record
+from bench.api import Asset, Attack, Defense, DescriptorAttack, ImageAttack, View
+from bench.codebook import dictionary
+from bench.codebook.public import Public
+from bench.core.progress import Progress
+from bench.extractors.sift import Sift
+from bench.geometry.lattice import unit_integer_points
+from bench.images import photographs
+from bench.registry import discovery, spec
+from bench.runner.other_releases import Population
+from bench.runner.records import Record
 from bench.types import Features, Knowledge, Subspaces
 from defenses.affine import Affine
-from leaderboard.reproduce.intervals import Interval, interval
+from leaderboard.intervals import Interval, interval
 from leaderboard.tables import markdown_row
 
 TABLE = Path(__file__).parents[1] / "docs" / "attacks.md"
@@ -108,7 +108,7 @@ def compared(title: str, defenses: Sequence[str], attacks: Sequence[str], by: st
 
 def run(defense: str, attack: str, work: Path) -> list[Record]:
     print(defense, attack, flush=True)
-    return bench.run([spec.read(defense, registry.DEFENSE)], [spec.read(attack, registry.ATTACK)], out=work)
+    return bench.run([spec.read(defense, discovery.DEFENSE)], [spec.read(attack, discovery.ATTACK)], out=work)
 
 
 def measured(records: Sequence[Record], metric: str) -> np.ndarray:
@@ -223,7 +223,7 @@ def speed() -> str:
             for source, secret in everybody:
                 seen = view(defense, secret, population, source.name)
                 for name in TIMED:
-                    spent[name][column].append(1e3 * seconds(spec.read(name, registry.ATTACK), seen) / len(secret))
+                    spent[name][column].append(1e3 * seconds(spec.read(name, discovery.ATTACK), seen) / len(secret))
                     progress.advance(note=f"{name}, dim {dim}")
     lines += [markdown_row((f"`{name}`", *(f"{np.mean(values):.2f}" for values in spent[name]))) for name in TIMED]
     return "\n".join([*lines, ""])

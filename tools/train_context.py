@@ -11,17 +11,17 @@ from pathlib import Path
 
 from make_assets import part
 
-from attacks.inversion.data import fitting_dictionaries, quantisation_error, quantise
-from attacks.inversion.plan import Training
-from attacks.inversion.train import check_quantisation
-from attacks.inversion.weights import describe
-from attacks.surroundings.network import Shape
-from attacks.surroundings.train import fit, lessons, validate
-from attacks.surroundings.weights import save
-from bench.datasets.photographs import SIDE, folder
-from bench.features.sift import Sift
-from bench.features.views import PhotographView, collect
-from bench.public import ASSETS, Public
+from bench.codebook.public import ASSETS, Public
+from bench.context.network import Shape
+from bench.context.train import fit, lessons, validate
+from bench.context.weights import save
+from bench.extractors.sift import Sift
+from bench.images.photographs import SIDE, folder
+from bench.images.views import PhotographView, collect
+from bench.inversion.data import fitting_dictionaries, quantisation_error, quantise
+from bench.inversion.plan import Training
+from bench.inversion.train import check_quantisation
+from bench.inversion.weights import describe
 from defenses.ldp import LDP
 
 SERVED = {field: LDP.serves[field] for field in ("epsilon", "subset_size")}

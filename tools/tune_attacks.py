@@ -24,20 +24,20 @@ import numpy as np
 from attacks.clustering import Clustering, candidates, chosen
 from attacks.database import Database
 from attacks.intersection import Intersection, described
-from bench import registry, spec
-from bench.datasets import photographs
-from bench.datasets.photographs import Source
-from bench.errors import UserError
-from bench.features.sift import Sift
-from bench.kernels.estimates import estimate
-from bench.kernels.meetings import meetings_within
-from bench.kernels.rebuilding import rebuilt
-from bench.kernels.sharing import Company, company
-from bench.kernels.subspaces import nearest_to_subspaces
-from bench.plugin import DescriptorAttack, View, lifted
-from bench.population import Population
-from bench.progress import Progress
-from bench.public import Public
+from bench.api import DescriptorAttack, View, lifted
+from bench.codebook.public import Public
+from bench.core.errors import UserError
+from bench.core.progress import Progress
+from bench.extractors.sift import Sift
+from bench.geometry.database_reconstruction import rebuilt
+from bench.geometry.estimates import estimate
+from bench.geometry.intersections import meetings_within
+from bench.geometry.shared_sub_database import Company, company
+from bench.geometry.subspaces import nearest_to_subspaces
+from bench.images import photographs
+from bench.images.photographs import Source
+from bench.registry import discovery, spec
+from bench.runner.other_releases import Population
 from bench.tasks.reconstruction import offered
 from bench.types import Floats, Knowledge
 from metrics.angle import Angle
@@ -168,7 +168,7 @@ def main() -> None:
 def measure(tuning: Tuning, sources: Sequence[Source]) -> np.ndarray:
     """Angle, share recovered, and coverage. -> (points, settings, photographs, 3)"""
     public, extractor = Public(), Sift()
-    defenses = [spec.read(point, registry.DEFENSE) for point in POINTS]
+    defenses = [spec.read(point, discovery.DEFENSE) for point in POINTS]
     populations = [
         Population(sources, extractor, defense, public, functools.partial(drawn, point)) for point, defense in enumerate(defenses)
     ]

@@ -19,15 +19,15 @@ import numpy as np
 from tune_attacks import row, write
 
 from attacks.clustering import Clustering
-from bench.datasets import photographs
-from bench.datasets.photographs import Source
-from bench.features.sift import Sift
-from bench.kernels.search import unit_rows
-from bench.kernels.sharing import company, nearest_that_meet
-from bench.plugin import View
-from bench.population import Population
-from bench.progress import Progress
-from bench.public import Public
+from bench.api import View
+from bench.codebook.public import Public
+from bench.core.progress import Progress
+from bench.extractors.sift import Sift
+from bench.geometry.nearest_words import unit_rows
+from bench.geometry.shared_sub_database import company, nearest_that_meet
+from bench.images import photographs
+from bench.images.photographs import Source
+from bench.runner.other_releases import Population
 from bench.tasks.collisions import no_collision
 from bench.types import Knowledge
 from defenses.affine import Affine

@@ -32,15 +32,15 @@ from typing import Literal
 
 import numpy as np
 
-from bench import fields
+from bench.api import Defense
 from bench.audit.events import Answers, answers, common, watch
 from bench.audit.exhaustive import NotEnumerableError, greatest_ratio, law
 from bench.audit.findings import Finding, Tally
-from bench.errors import UserError
-from bench.exact import exact
-from bench.kernels.search import unit_rows
-from bench.plugin import Defense
-from bench.public import Public
+from bench.codebook.public import Public
+from bench.core.errors import UserError
+from bench.core.exact import exact
+from bench.geometry.nearest_words import unit_rows
+from bench.registry import fields
 from bench.testing import example_features, small_dictionary
 from bench.types import Features
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.errors import UserError
+from bench.core.errors import UserError
 
 SMALL = 1024  # outcomes
 PROBES = 12

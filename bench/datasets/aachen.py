@@ -19,11 +19,12 @@ from typing import Literal, get_args
 
 import pycolmap
 
-from bench.datasets import colmap, lists, nvm
+from bench.api import Dataset
+from bench.core.errors import UserError
+from bench.datasets import colmap
 from bench.datasets.colmap import Placed
-from bench.datasets.scene import Condition, Scene
-from bench.errors import UserError
-from bench.plugin import Dataset
+from bench.formats import lists, nvm
+from bench.images.scene import Condition, Scene
 
 Version = Literal["v1", "v1.1"]
 

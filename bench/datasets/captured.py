@@ -15,14 +15,14 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from bench import cache, provenance
+from bench.api import Dataset
+from bench.cache import provenance, store
+from bench.core.colmap_log import quietly
+from bench.core.errors import UserError
 from bench.datasets import colmap
 from bench.datasets.colmap import Placed
-from bench.datasets.photographs import Source, folder
-from bench.datasets.scene import File, Reference, Scene
-from bench.errors import UserError
-from bench.plugin import Dataset
-from bench.quietly import quietly
+from bench.images.photographs import Source, folder
+from bench.images.scene import File, Reference, Scene
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,7 +74,7 @@ def _model(directory: Path, sources: list[Source]) -> Path:
             _structure_from_motion(directory, [source.name for source in sources], Path(scratch)).write(kept)
 
     photographs = {source.name: source.content_hash() for source in sources}
-    return cache.folder(
+    return store.folder(
         "models", {"pycolmap": pycolmap.__version__, "photographs": photographs, "source": provenance.source(__name__)}, make
     )
 

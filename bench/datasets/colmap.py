@@ -20,10 +20,10 @@ from typing import get_args
 import numpy as np
 import pycolmap
 
-from bench.datasets import lists
-from bench.datasets.scene import Condition, File, Reference, Scene, SceneImage
-from bench.errors import UserError
-from bench.plugin import Dataset
+from bench.api import Dataset
+from bench.core.errors import UserError
+from bench.formats import lists
+from bench.images.scene import Condition, File, Reference, Scene, SceneImage
 
 PARTS = ("cameras", "images", "points3D")
 

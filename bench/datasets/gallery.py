@@ -18,9 +18,9 @@ import numpy as np
 import pycolmap
 
 import bench.rendering
-from bench.datasets.scene import Condition, Mask, Pixels, Reference, Scene, SceneImage
-from bench.errors import UserError
-from bench.plugin import Dataset
+from bench.api import Dataset
+from bench.core.errors import UserError
+from bench.images.scene import Condition, Mask, Pixels, Reference, Scene, SceneImage
 from bench.rendering import crowd, cutouts, walks
 from bench.rendering.building import Building, build
 from bench.rendering.cutouts import Person

@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from bench.api import Dataset
+from bench.core.errors import UserError
 from bench.datasets.gallery import Gallery
-from bench.datasets.scene import Scene
-from bench.errors import UserError
-from bench.plugin import Dataset
+from bench.images.scene import Scene
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,14 +14,14 @@ import numpy as np
 import pycolmap
 import torch
 
-from bench.datasets.scene import Reference
-from bench.device import pick_device
-from bench.errors import UserError
-from bench.kernels.distances import mutual, points_to_points
-from bench.localization import covisible
+from bench.core.colmap_log import quietly
+from bench.core.device import pick_device
+from bench.core.errors import UserError
+from bench.core.progress import Progress
+from bench.geometry.distances import mutual, points_to_points
+from bench.images.scene import Reference
+from bench.localization import covisibility
 from bench.localization.maps import Map
-from bench.progress import Progress
-from bench.quietly import quietly
 from bench.types import Features, Indices
 
 RATIO = 0.8  # of the ratio test among references
@@ -38,7 +38,7 @@ def build(references: Sequence[Reference], features: Sequence[Features]) -> Map:
     UserError
         if no point could be triangulated.
     """
-    matches = verified(references, features, _matched(features, covisible.pairs(references)))
+    matches = verified(references, features, _matched(features, covisibility.pairs(references)))
     points, xyz = triangulate(references, features, matches)
     if len(xyz) == 0:
         raise UserError("the map has no point: do the references overlap?")

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.kernels.search import unit_rows
-from bench.tensorfile import Arrays
+from bench.formats.tensor_file import Arrays
+from bench.geometry.nearest_words import unit_rows
 from bench.types import Bytes, Floats, Indices
 
 KIND = "map"

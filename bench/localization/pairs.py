@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from bench.datasets import lists
-from bench.errors import UserError
+from bench.core.errors import UserError
+from bench.formats import lists
 
 
 def read(path: Path) -> dict[str, list[str]]:

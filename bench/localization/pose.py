@@ -15,7 +15,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from bench.errors import unknown
+from bench.core.errors import unknown
 
 Doubles = NDArray[np.float64]
 Solver = Literal["poselib", "pycolmap"]

@@ -7,17 +7,17 @@ from dataclasses import dataclass
 import numpy as np
 import pycolmap
 
-from bench import spec
-from bench.features.dictionary import Dictionary
-from bench.kernels.subspaces import guesses
-from bench.localization import matching, pose
-from bench.localization.matching import Correspondences, Retrieved
+from bench.api import Defense
+from bench.codebook.dictionary import Dictionary
+from bench.codebook.public import REFERENCES, Public
+from bench.core.randomness import randomness
+from bench.geometry.subspaces import guesses
+from bench.localization import map_matching, pose
+from bench.localization.map_matching import Correspondences, Retrieved
 from bench.localization.pose import Estimate
 from bench.localization.retrieval import TOP
-from bench.place import Place
-from bench.plugin import Defense
-from bench.public import REFERENCES, Public
-from bench.randomness import randomness
+from bench.localization.scene_index import Place
+from bench.registry import spec
 from bench.types import Bytes, Descriptors, Features, Floats, Indices, Release, Subspaces, WordSets
 
 VOCABULARY = 16_000  # words that retrieval by descriptors uses, if the references have four times as many
@@ -75,7 +75,7 @@ class Server:
         matcher : one of matching.MATCHERS that applies to the release
         trials : of RANSAC, at most
         """
-        how = matching.MATCHERS[matcher]()
+        how = map_matching.MATCHERS[matcher]()
         known = self.dictionary(defense) if how.by_words and defense is not None else None
         retrieved = Retrieved(
             map=self.place.map,

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from bench.datasets.photographs import decode, of_people
+from bench.images.photographs import decode, of_people
+from bench.rendering.artworks import blobs, glyphs, mosaic
 from bench.rendering.noise import colour, colours, fractal, pixels
-from bench.rendering.paintings import blobs, glyphs, mosaic
 from bench.types import Bytes, Floats
 
 TALL, WIDE = 480, 224  # pixels of a cut-out

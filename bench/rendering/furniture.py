@@ -10,7 +10,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from bench.rendering import paintings, surfaces
+from bench.rendering import artworks, surfaces
 from bench.rendering.mipmap import Texture
 from bench.rendering.noise import Size
 from bench.rendering.raster import Doubles
@@ -230,7 +230,7 @@ class _Furnisher:
                 side = rng.uniform(0.3, 0.75, 2) * scale
                 ph, pw = min(int(side[0]), h - 4), min(int(side[1]), w - 4)
                 top, left = rng.integers(0, h - ph), rng.integers(0, w - pw)
-                canvas[top : top + ph, left : left + pw] = paintings.picture(rng, (ph, pw))
+                canvas[top : top + ph, left : left + pw] = artworks.picture(rng, (ph, pw))
             return canvas
 
         return self._paint(board, (tall, wide), PICTURE * 0.8)
@@ -289,7 +289,7 @@ class _Furnisher:
         alike = [texture for shape, texture in self._pictures if abs(np.log(shape * tall / wide)) < 0.15]
         if alike and self._rng.random() < self._repeats:
             return alike[self._rng.integers(len(alike))]
-        texture = self._paint(lambda rng, size, scale: paintings.picture(rng, size), (tall, wide), PICTURE)
+        texture = self._paint(lambda rng, size, scale: artworks.picture(rng, size), (tall, wide), PICTURE)
         self._pictures.append((wide / tall, texture))
         return texture
 
@@ -303,11 +303,11 @@ class _Furnisher:
 
 
 def _marbled(rng: np.random.Generator, size: Size, scale: float) -> Bytes:
-    return paintings.marble(rng, size)
+    return artworks.marble(rng, size)
 
 
 def _abstract(rng: np.random.Generator, size: Size, scale: float) -> Bytes:
-    return paintings.blobs(rng, size)
+    return artworks.blobs(rng, size)
 
 
 def _choose(rng: np.random.Generator, among: tuple[_T, ...]) -> _T:

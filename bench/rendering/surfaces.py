@@ -10,7 +10,7 @@ from functools import cache
 import cv2
 import numpy as np
 
-from bench.datasets.photographs import decode, of_grounds
+from bench.images.photographs import decode, of_grounds
 from bench.rendering.noise import Size, cells, colour, colours, fractal, pixels
 from bench.types import Bytes, Floats
 

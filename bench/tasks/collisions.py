@@ -18,15 +18,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bench import fields
-from bench.errors import UnitError, UserError
-from bench.kernels.meetings import MEETS, Doubles
-from bench.kernels.search import unit_rows
-from bench.kernels.sharing import company, nearest_that_meet
-from bench.plugin import Attack, Dataset, Defense, Extractor, Lifting, Outcome, Task, Trial, leads_through_no_word
-from bench.public import Public
+from bench.api import Attack, Dataset, Defense, Extractor, Lifting, Outcome, Task, Trial, leads_through_no_word
+from bench.codebook.public import Public
+from bench.core.errors import UnitError, UserError
+from bench.geometry.intersections import MEETS, Doubles
+from bench.geometry.nearest_words import unit_rows
+from bench.geometry.shared_sub_database import company, nearest_that_meet
+from bench.images.samples import Collection, Images, photographs_alone
+from bench.registry import fields
 from bench.types import Release, Subspaces
-from bench.units import Collection, Images, photographs_alone
 
 
 @dataclass(frozen=True, kw_only=True)

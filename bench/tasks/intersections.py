@@ -20,14 +20,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bench import fields
-from bench.errors import UnitError, UserError
-from bench.kernels.search import unit_rows
-from bench.kernels.subspaces import nearest_to_subspaces
-from bench.plugin import Attack, Dataset, Defense, Extractor, Lifting, Outcome, Task, Trial, leads_through_no_word
-from bench.public import Public
+from bench.api import Attack, Dataset, Defense, Extractor, Lifting, Outcome, Task, Trial, leads_through_no_word
+from bench.codebook.public import Public
+from bench.core.errors import UnitError, UserError
+from bench.geometry.nearest_words import unit_rows
+from bench.geometry.subspaces import nearest_to_subspaces
+from bench.images.samples import Collection, Images, photographs_alone
+from bench.registry import fields
 from bench.types import Features, Floats
-from bench.units import Collection, Images, photographs_alone
 
 COUNTS = (50, 20, 10, 5)  # N
 BATCH = 64  # subspaces at a time

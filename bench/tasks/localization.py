@@ -13,17 +13,17 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from bench import units
-from bench.datasets import lists
+from bench.api import Attack, Dataset, Defense, Extractor, Outcome, Task, Trial
+from bench.codebook.public import Public
+from bench.core.errors import UnitError, UserError
 from bench.datasets.gallery import Gallery
-from bench.datasets.scene import SceneImage
-from bench.errors import UnitError, UserError
-from bench.localization import matching, pairs, pose
+from bench.formats import lists
+from bench.images import samples
+from bench.images.samples import Collection, Images
+from bench.images.scene import SceneImage
+from bench.localization import map_matching, pairs, pose
 from bench.localization.server import Server
-from bench.plugin import Attack, Dataset, Defense, Extractor, Outcome, Task, Trial
-from bench.public import Public
 from bench.types import Features, Indices
-from bench.units import Collection, Images
 
 # Within which a pose counts: units of length and degrees (Sattler et al., CVPR 2018).
 THRESHOLDS = {"0.25m_2deg": (0.25, 2.0), "0.5m_5deg": (0.5, 5.0), "5m_10deg": (5.0, 10.0)}
@@ -55,11 +55,11 @@ class Localization(Task):
     def collection(self, images: Images, dataset: Dataset | None) -> Collection:
         if images is not None:
             raise UserError("localization is about the queries of a dataset and takes no images; give --dataset")
-        return units.of_queries(dataset or Gallery())
+        return samples.of_queries(dataset or Gallery())
 
     def inapplicable(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> str | None:
         name = self._matcher(defense)
-        return f"nothing matches {defense.releases.__name__}" if name is None else matching.inapplicable(name, defense)
+        return f"nothing matches {defense.releases.__name__}" if name is None else map_matching.inapplicable(name, defense)
 
     def resolved(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> Mapping[str, Any]:
         return {}
@@ -89,7 +89,7 @@ class Localization(Task):
         return Outcome(metrics={**within(errors), **told}, estimates=estimates)
 
     def _matcher(self, defense: Defense) -> str | None:
-        return matching.default(defense) if self.matcher == "auto" else self.matcher
+        return map_matching.default(defense) if self.matcher == "auto" else self.matcher
 
     def _retrieved(self, server: Server, trial: Trial, query: SceneImage) -> Indices:
         if self.pairs is not None:

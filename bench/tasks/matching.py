@@ -22,14 +22,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from bench import matching, units
-from bench.datasets import homographies
-from bench.datasets.homographies import Pair
-from bench.errors import UnitError, UserError
-from bench.plugin import Attack, Dataset, Defense, Extractor, Outcome, Task, Trial
-from bench.public import Public
+from bench.api import Attack, Dataset, Defense, Extractor, Outcome, Task, Trial
+from bench.codebook.public import Public
+from bench.core.errors import UnitError, UserError
+from bench.images import samples
+from bench.images.samples import Collection, Images, Unit
+from bench.localization import two_view_matching
+from bench.rendering import homographies
+from bench.rendering.homographies import Pair
 from bench.types import Descriptors, Floats, Indices, Subspaces, WordSets
-from bench.units import Collection, Images, Unit
 
 Doubles = NDArray[np.float64]
 
@@ -79,8 +80,8 @@ class Matching(Task):
         if not isinstance(pair, Pair):
             raise UnitError("matching needs a pair of images with a homography")
         query, reference = trial.shots
-        second = reference.release if self.both else matching.unprotected(reference.secret, trial.defense, trial.public)
-        found = matching.matches(query.release, second, self.ratio)
+        second = reference.release if self.both else two_view_matching.unprotected(reference.secret, trial.defense, trial.public)
+        found = two_view_matching.matches(query.release, second, self.ratio)
         return Outcome(metrics=accuracy(query.release.keypoints, second.keypoints, pair.homography, found))
 
 
@@ -126,7 +127,7 @@ def _collected(name: str, pairs: Sequence[Pair]) -> Collection:
     return Collection(
         name=name,
         units=tuple(Unit(name=pair.name, images=(pair.first, pair.second), subject=pair) for pair in pairs),
-        beside={"homographies": units.digest(homographies_of)},
+        beside={"homographies": samples.digest(homographies_of)},
     )
 
 

@@ -10,26 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from bench import fields, recovery, registry, spec, units
-from bench.datasets.scene import Mask
-from bench.errors import UnitError, UserError, blamed
-from bench.plugin import (
-    Attack,
-    Dataset,
-    Defense,
-    Extractor,
-    ImageAttack,
-    LocalMetric,
-    Metric,
-    Outcome,
-    Selection,
-    Task,
-    Trial,
-    View,
-)
-from bench.public import Public
+from bench.api import Attack, Dataset, Defense, Extractor, ImageAttack, LocalMetric, Metric, Outcome, Selection, Task, Trial, View
+from bench.cache import attack_cache
+from bench.codebook.public import Public
+from bench.core.errors import UnitError, UserError, blamed
+from bench.images import samples
+from bench.images.samples import Collection, Images
+from bench.images.scene import Mask
+from bench.registry import discovery, fields, spec
 from bench.types import Descriptors, Floats, Knowledge
-from bench.units import Collection, Images
 
 RELEASES = {Knowledge.OTHER_RELEASES, Knowledge.REPEATED_RELEASES}  # which every defense can make
 
@@ -47,10 +36,10 @@ class Reconstruction(Task):
 
     def collection(self, images: Images, dataset: Dataset | None) -> Collection:
         if dataset is None:
-            return units.of_photographs(images)
+            return samples.of_photographs(images)
         if images is not None:
             raise UserError("reconstruction takes photographs or the queries of a dataset, not both")
-        return units.of_queries(dataset)
+        return samples.of_queries(dataset)
 
     def inapplicable(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> str | None:
         if attack is None:
@@ -81,7 +70,7 @@ class Reconstruction(Task):
             raise UnitError("reconstruction needs an attack")
         if isinstance(attack, ImageAttack):
             return compared(trial, None, reconstructed(attack, view(trial), trial))
-        found = recovery.recovered(attack, trial, view(trial))
+        found = attack_cache.recovered(attack, trial, view(trial))
         inverter, undefended, reason = self._inverter(trial.extractor, trial.public)
         if reason is not None:
             outcome = compared(trial, found.selection, None, (*found.notes, f"no image: {reason}"))
@@ -94,10 +83,10 @@ class Reconstruction(Task):
 
     def _inverter(self, extractor: Extractor, public: Public) -> tuple[ImageAttack, Defense, str | None]:
         """The attack that paints descriptors, the defense that it was made for, and why it cannot be used, if it cannot."""
-        inverter = spec.read(self.inverter, registry.ATTACK)
+        inverter = spec.read(self.inverter, discovery.ATTACK)
         if not isinstance(inverter, ImageAttack):
             raise UserError(f"reconstruction: inverter must reconstruct images, and {inverter.name()} does not")
-        undefended = registry.lookup(registry.DEFENSE, "none")()
+        undefended = discovery.lookup(discovery.DEFENSE, "none")()
         return inverter, undefended, inverter.inapplicable(undefended, extractor, public)
 
 
@@ -144,7 +133,7 @@ def reconstructed(attack: ImageAttack, seen: View, trial: Trial) -> Floats:
     with blamed(f"plugin {attack.name()}"):
         image: Floats = trial.carry_out(attack.reconstruct, seen, trial.rng)
         width, height = seen.release.size
-        recovery.expect(image, (height, width, 3))
+        attack_cache.expect(image, (height, width, 3))
         if image.min() < 0 or image.max() > 1:
             raise ValueError(f"returned values from {image.min()} to {image.max()}, expected 0 to 1")
     return image

@@ -1,7 +1,7 @@
 """Structure from motion: the model that a server makes of a place from nothing but releases (the paper's supplement, Table S2).
 
 All images are privatised. Two keypoints match by a word that both images release and that is unique in each, by mutually
-nearest descriptors, or by mutually nearest subspaces. Pairs of images are verified and mapped as `bench/structure/` says.
+nearest descriptors, or by mutually nearest subspaces. Pairs of images are verified and mapped as `bench/sfm/` says.
 """
 
 from __future__ import annotations
@@ -14,16 +14,17 @@ from typing import Any, ClassVar
 import numpy as np
 import pycolmap
 
-from bench import matching, units
-from bench.datasets.scene import SceneImage
+from bench.api import Attack, Dataset, Defense, Extractor, Outcome, Task, Trial
+from bench.codebook.public import Public
+from bench.core.errors import UnitError, UserError
 from bench.datasets.walk import Walk
-from bench.errors import UnitError, UserError
-from bench.plugin import Attack, Dataset, Defense, Extractor, Outcome, Task, Trial
-from bench.public import Public
-from bench.structure import agreement, mapping, picture, verification
-from bench.structure.mapping import Mapper, Model
+from bench.images import samples
+from bench.images.samples import Collection, Images, Unit
+from bench.images.scene import SceneImage
+from bench.localization import two_view_matching
+from bench.sfm import agreement, incremental_mapping, picture, verification
+from bench.sfm.incremental_mapping import Mapper, Model
 from bench.types import Descriptors, Release, Subspaces, WordSets
-from bench.units import Collection, Images, Unit
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,8 +42,8 @@ class Structure(Task):
     mapper: Mapper = "global"
 
     def __post_init__(self) -> None:
-        if self.images < mapping.SMALLEST:
-            raise UserError(f"structure: images must be at least {mapping.SMALLEST}, got {self.images}")
+        if self.images < incremental_mapping.SMALLEST:
+            raise UserError(f"structure: images must be at least {incremental_mapping.SMALLEST}, got {self.images}")
         if not 0 < self.ratio <= 1:
             raise UserError(f"structure: ratio must be above 0 and at most 1, got {self.ratio}")
         if self.mapper not in ("incremental", "global"):
@@ -55,13 +56,13 @@ class Structure(Task):
             )
         scene = (dataset or Walk()).scene()
         chosen = scene.queries[: self.images]
-        if len(chosen) < mapping.SMALLEST:
+        if len(chosen) < incremental_mapping.SMALLEST:
             raise UserError(f"{scene.name}: {len(chosen)} queries, of which nothing can be rebuilt")
         for image in chosen:
             if _intrinsics(image.camera) != _intrinsics(chosen[0].camera):
                 raise UserError(f"{scene.name}: {chosen[0].name} and {image.name} are of different cameras; structure takes one")
         unit = Unit(name=scene.name, images=tuple(image.pixels for image in chosen), subject=chosen)
-        return Collection(name=scene.name, units=(unit,), scene=scene, beside={"scene": units.fingerprint(chosen)})
+        return Collection(name=scene.name, units=(unit,), scene=scene, beside={"scene": samples.fingerprint(chosen)})
 
     def inapplicable(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> str | None:
         if issubclass(defense.releases, (Descriptors, Subspaces, WordSets)):
@@ -78,7 +79,7 @@ class Structure(Task):
         camera, seed = images[0].camera, int(trial.rng.integers(2**31))
         found = {(a, b): self._matches(releases[a], releases[b]) for a, b in itertools.combinations(range(len(releases)), 2)}
         geometries = verification.verified(camera, keypoints, found, seed)
-        model = mapping.mapped(camera, keypoints, geometries, self.mapper, seed)
+        model = incremental_mapping.mapped(camera, keypoints, geometries, self.mapper, seed)
         told = {
             "images": float(len(images)),
             "tried_matches": float(np.mean([len(pairs) for pairs in found.values()])),
@@ -94,7 +95,7 @@ class Structure(Task):
         try:
             # Subspaces are as far from their second nearest as from their nearest, nearly: the ratio would tell nothing.
             ratio = 1.0 if isinstance(first, Subspaces) else self.ratio
-            return matching.matches(first, second, ratio, unique=True)
+            return two_view_matching.matches(first, second, ratio, unique=True)
         except TypeError as error:
             raise UnitError(str(error)) from None
 

@@ -16,7 +16,7 @@ from enum import Enum
 
 import pandas as pd
 
-from leaderboard.reproduce.intervals import Interval, independent, interval
+from leaderboard.intervals import Interval, independent, interval
 
 Cell = tuple[str, str]  # a row's name, a measure
 

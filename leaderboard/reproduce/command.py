@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING
 
 from rich.text import Text
 
-from bench import engines, threads
-from bench.engines import Engine
-from bench.errors import UserError, unknown
-from bench.features.sift import Sift
-from bench.plugin import Asset, Dataset, Extractor
-from leaderboard import localized
-from leaderboard.reproduce import figures, report, run, tables
+from bench.api import Asset, Dataset, Extractor
+from bench.core import threads
+from bench.core.errors import UserError, unknown
+from bench.extractors.sift import Sift
+from bench.runner import engines
+from bench.runner.engines import Engine
+from leaderboard import localization_results
+from leaderboard.reproduce import figures, page, run, tables
 from leaderboard.reproduce.drawing import Drawing, Scene, save
 from leaderboard.reproduce.profiles import Materials, Setting, profile
 from leaderboard.reproduce.run import Judged
@@ -82,12 +83,12 @@ def reproduce(
     if table is None:
         return _figures(name, drawings[name], setting, judged, folder, engine)
     rebuilt = run.rebuild(table, setting, judged, folder, engine)
-    report.write(rebuilt, folder)
+    page.write(rebuilt, folder)
     scene = Scene(setting=setting, judged=judged, ran=rebuilt.ran, out=folder)
     every = (record for records in rebuilt.ran.records.values() for record in records)
-    files = [Text(line) for line in localized.write(every, folder)]
+    files = [Text(line) for line in localization_results.write(every, folder)]
     files += [] if table.draw is None else _drawn(name, table.draw(scene), folder)
-    return Done(out=folder, shown=(*report.to_rich(rebuilt), *files), failed=run.failures(rebuilt.ran))
+    return Done(out=folder, shown=(*page.to_rich(rebuilt), *files), failed=run.failures(rebuilt.ran))
 
 
 def drawn_by() -> dict[str, tuple[Drawing, ...]]:

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from PIL import Image
 
-from bench import units
-from bench.errors import UnitError
-from bench.rundir import picture
+from bench.core.errors import UnitError
+from bench.images import samples
+from bench.runner.directory import picture
 from bench.types import Bytes
 from leaderboard.figures import Panel
 from leaderboard.reproduce.profiles import Setting
@@ -42,7 +42,7 @@ class Scene:
         """The names of the units that can be read, and their pixels."""
         for unit in self.judged.units:
             with contextlib.suppress(UnitError):
-                yield unit.name, units.read(unit.images[0])[0]
+                yield unit.name, samples.read(unit.images[0])[0]
 
     def panel(self, row: str, unit: str, title: str = "", shown: Mapping[str, str] = SSIM, digits: int = 3) -> Panel:
         """The picture made of a unit in a row of a table, with metrics beneath, by label; or why there is none."""

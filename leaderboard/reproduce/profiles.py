@@ -6,10 +6,10 @@ import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from bench.api import Asset, Extractor
+from bench.core.errors import unknown
 from bench.datasets.gallery import Gallery
 from bench.datasets.walk import Walk
-from bench.errors import unknown
-from bench.plugin import Asset, Extractor
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,18 +9,18 @@ from pathlib import Path
 
 import pandas as pd
 
-from bench import runner, units
-from bench.datasets import photographs
-from bench.datasets.photographs import Source
-from bench.engines import HERE, Engine
-from bench.plugin import Dataset, Task
-from bench.progress import Progress
-from bench.records import Record
-from bench.runner import Plan
-from bench.units import Unit
+from bench.api import Dataset, Task
+from bench.core.progress import Progress
+from bench.images import photographs, samples
+from bench.images.photographs import Source
+from bench.images.samples import Unit
+from bench.runner import plan as runner
+from bench.runner.engines import HERE, Engine
+from bench.runner.plan import Plan
+from bench.runner.records import Record
+from leaderboard.intervals import Interval, interval, proportion, rank_correlation
 from leaderboard.reproduce import study
 from leaderboard.reproduce.claims import Cell, Finding, judge
-from leaderboard.reproduce.intervals import Interval, interval, proportion, rank_correlation
 from leaderboard.reproduce.profiles import Profile, Setting
 from leaderboard.reproduce.study import Measure, Row, Table
 
@@ -38,7 +38,7 @@ class Judged:
     @property
     def units(self) -> tuple[Unit, ...]:
         """What records are about."""
-        return (units.of_photographs(self.chosen) if self.dataset is None else units.of_queries(self.dataset)).units
+        return (samples.of_photographs(self.chosen) if self.dataset is None else samples.of_queries(self.dataset)).units
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -6,10 +6,10 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from bench import fields, registry, spec
-from bench.features.sift import Sift
-from bench.plugin import Asset, Attack, Dataset, Defense, Extractor, Plugin, Task
-from bench.registry import Kind
+from bench.api import Asset, Attack, Dataset, Defense, Extractor, Plugin, Task
+from bench.extractors.sift import Sift
+from bench.registry import discovery, fields, spec
+from bench.registry.discovery import Kind
 from bench.tasks.reconstruction import Reconstruction
 from leaderboard.reproduce.claims import Cell, Claim
 from leaderboard.reproduce.profiles import Profile, Setting
@@ -78,6 +78,6 @@ def reconstruction(setting: Setting) -> Reconstruction:
 
 def build(kind: Kind[P], name: str, given: Mapping[str, Any], where_there_are: Mapping[str, Any] | None = None) -> P:
     """The plugin of that name with the fields `given`, and with those others that it has."""
-    plugin = registry.lookup(kind, name)
+    plugin = discovery.lookup(kind, name)
     types = fields.field_types(plugin)
     return spec.build(plugin, {**given, **{field: value for field, value in (where_there_are or {}).items() if field in types}})

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from bench.datasets import photographs
-from bench.runner import Asked
-from bench.suite import Suite
+from bench.images import photographs
+from bench.runner.plan import Asked
+from bench.runner.suite import Suite
 from leaderboard.reproduce import run, tables
 from leaderboard.reproduce.profiles import CPU, Materials, Setting
 

@@ -6,9 +6,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from leaderboard.marks import Mark, place_labels
+from leaderboard.intervals import Interval
+from leaderboard.plot_style import Mark, place_labels
 from leaderboard.plots import family_marks, settings
-from leaderboard.reproduce.intervals import Interval
 from leaderboard.tables import number
 from leaderboard.tradeoff import Point, Tradeoff
 

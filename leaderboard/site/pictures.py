@@ -10,13 +10,13 @@ from pathlib import Path
 
 from PIL import Image
 
-from bench import rundir, units
-from bench.datasets import photographs
-from bench.datasets.photographs import Source
-from bench.errors import UnitError
-from bench.records import Record
-from leaderboard import report
-from leaderboard.boards import Found
+from bench.core.errors import UnitError
+from bench.images import photographs, samples
+from bench.images.photographs import Source
+from bench.runner import directory
+from bench.runner.records import Record
+from leaderboard import run_report
+from leaderboard.comparison import Found
 
 FOLDER = "pictures"
 QUALITY = 90  # of WebP
@@ -33,9 +33,9 @@ class Pair:
 def pairs(found: Iterable[Found], out: Path) -> Iterator[tuple[Record, Pair]]:
     """The records of which there is a reconstruction, with their pictures, which are written into the site `out`."""
     for one in found:
-        made = _as_it_is(one.folder, rundir.picture(one.folder, one.record), out)
+        made = _as_it_is(one.folder, directory.picture(one.folder, one.record), out)
         if made is not None:
-            original = _as_it_is(one.folder, report.photograph(one.folder, one.record), out) or _builtin(one.record, out)
+            original = _as_it_is(one.folder, run_report.photograph(one.folder, one.record), out) or _builtin(one.record, out)
             yield one.record, Pair(made=made, original=original)
 
 
@@ -74,4 +74,4 @@ def _written(content: bytes, read: Callable[[], Image.Image], out: Path) -> str 
 def _all_builtin() -> tuple[dict[str, Source], str]:
     """By name, and the hash that records know them by."""
     sources = {source.name: source for source in photographs.builtin()}
-    return sources, units.digest({name: source.content_hash() for name, source in sources.items()})
+    return sources, samples.digest({name: source.content_hash() for name, source in sources.items()})

@@ -13,15 +13,15 @@ from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bench.environment import DISTRIBUTION
-from bench.errors import UserError
-from bench.progress import Progress
-from leaderboard import boards, plots, recipe, sheets
-from leaderboard.boards import Board
+from bench.core.environment import DISTRIBUTION
+from bench.core.errors import UserError
+from bench.core.progress import Progress
+from leaderboard import comparison, group_tables, plots, recipe
+from leaderboard.comparison import Board
+from leaderboard.group_tables import Sheet
 from leaderboard.recipe import Lookup
 from leaderboard.reproduce.drawing import save
-from leaderboard.sheets import Sheet
-from leaderboard.site import cells
+from leaderboard.site import experiments
 from leaderboard.site.chart import charts
 from leaderboard.tradeoff import tradeoffs
 
@@ -29,7 +29,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PAGE = "index.html"
-WRITERS: dict[str, Callable[[Sheet], str]] = {"md": sheets.to_markdown, "csv": sheets.to_csv, "tex": sheets.to_latex}
+WRITERS: dict[str, Callable[[Sheet], str]] = {
+    "md": group_tables.to_markdown,
+    "csv": group_tables.to_csv,
+    "tex": group_tables.to_latex,
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,8 +56,8 @@ def write(results: Path, out: Path) -> Done:
     OSError
         if it cannot be written.
     """
-    found = boards.find(results)
-    made = boards.boards(found)
+    found = comparison.find(results)
+    made = comparison.boards(found)
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -71,16 +75,16 @@ def _board(board: Board, every: Sequence[Board], out: Path, progress: Progress, 
     """All that the page shows of a board; its tables, plots and pictures are written."""
     found = tradeoffs(board, every) if board.attacked else []
     name = _file_name(board)
-    sheet = sheets.pairs(board)
-    tables = {"pairs": sheet} | ({"ranking": sheets.ranking(board)} if board.attacked else {})
+    sheet = group_tables.pairs(board)
+    tables = {"pairs": sheet} | ({"ranking": group_tables.ranking(board)} if board.attacked else {})
     shown = []
     for row in sheet.rows:
-        shown.append(cells.view(board, sheet, row, found, out, lookup))
+        shown.append(experiments.view(board, sheet, row, found, out, lookup))
         progress.advance(note=board.title)
     return {
         "board": board,
         "sheet": sheet,
-        "columns": cells.columns(sheet),
+        "columns": experiments.columns(sheet),
         "cells": shown,
         "charts": charts(found),
         "tables": [_tables(table, f"{name}-{kind}", out) for kind, table in tables.items()],

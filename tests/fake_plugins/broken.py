@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.plugin import Defense, Privacy
-from bench.public import Public
+from bench.api import Defense, Privacy
+from bench.codebook.public import Public
 from bench.types import Descriptors, Features
 
 

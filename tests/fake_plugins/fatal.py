@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.plugin import ImageAttack, View
+from bench.api import ImageAttack, View
 from bench.types import Descriptors, Floats, Subspaces, WordSets
 
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.plugin import Selection, SelectiveAttack, View
+from bench.api import Selection, SelectiveAttack, View
 from bench.types import Descriptors
 
 

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.kernels.search import unit_rows
-from bench.plugin import DescriptorAttack, View
+from bench.api import DescriptorAttack, View
+from bench.geometry.nearest_words import unit_rows
 from bench.types import Floats, Subspaces, WordSets
 
 

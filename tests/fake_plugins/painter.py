@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.plugin import ImageAttack, View
+from bench.api import ImageAttack, View
 from bench.types import Descriptors, Floats, Subspaces, WordSets
 
 

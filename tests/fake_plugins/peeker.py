@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.plugin import DescriptorAttack, View
+from bench.api import DescriptorAttack, View
 from bench.types import Features, Floats, WordSets
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from bench import registry
+from bench.registry import discovery
 from leaderboard.figures import Panel, draw
-from leaderboard.reproduce import places
+from leaderboard.reproduce import scenes
 from leaderboard.reproduce.drawing import Drawing, Scene
 from leaderboard.reproduce.profiles import Setting
 from leaderboard.reproduce.study import Row, build, reconstruction
@@ -20,13 +20,13 @@ LDP = ("256000", "12", 2)  # |K|, ε, m of the paper that nearly every query is 
 
 
 def rows(setting: Setting) -> tuple[Row, ...]:
-    attack = build(registry.ATTACK, "inlier", {"trials": round(places.TRIALS * setting.profile.trials)})
-    undefended = build(registry.DEFENSE, "none", {})
+    attack = build(discovery.ATTACK, "inlier", {"trials": round(scenes.TRIALS * setting.profile.trials)})
+    undefended = build(discovery.DEFENSE, "none", {})
     attacked = {
-        "none, all keypoints (DIA)": (undefended, build(registry.ATTACK, "dia", {"weights": setting.materials.raw_network})),
+        "none, all keypoints (DIA)": (undefended, build(discovery.ATTACK, "dia", {"weights": setting.materials.raw_network})),
         "none, inliers": (undefended, attack),
-        "affine, dim 4, inliers": (build(registry.DEFENSE, "affine", {"dim": 4}), attack),
-        f"ldp, {places.name(*LDP)}, inliers": (places.defense(setting, *LDP), attack),
+        "affine, dim 4, inliers": (build(discovery.DEFENSE, "affine", {"dim": 4}), attack),
+        f"ldp, {scenes.name(*LDP)}, inliers": (scenes.defense(setting, *LDP), attack),
     }
     return tuple(
         Row(name=name, labels={}, paper={}, defense=defense, attack=by, task=reconstruction(setting))

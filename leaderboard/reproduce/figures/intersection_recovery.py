@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench import registry
+from bench.registry import discovery
 from leaderboard.reproduce.drawing import Drawing, Scene
 from leaderboard.reproduce.profiles import Setting
 from leaderboard.reproduce.run import of
@@ -39,8 +39,8 @@ def rows(setting: Setting) -> tuple[Row, ...]:
         for seen in counts(setting, dim):
             asked = {"others": seen, "coverage": 1.0}  # so that none is left unseen
             trials = (
-                (attacked(dim, seen), build(registry.ATTACK, "intersection", asked), reconstruction(setting)),
-                (covered(dim, seen), None, build(registry.TASK, "collisions", asked)),
+                (attacked(dim, seen), build(discovery.ATTACK, "intersection", asked), reconstruction(setting)),
+                (covered(dim, seen), None, build(discovery.TASK, "collisions", asked)),
             )
             found += [
                 Row(name=name, labels={}, paper={}, defense=table1.lifting(dim, setting), attack=attack, task=task)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from leaderboard.figures import Panel, draw
-from leaderboard.reproduce import places, run
+from leaderboard.reproduce import run, scenes
 from leaderboard.reproduce.drawing import Drawing, Scene
 from leaderboard.reproduce.profiles import Setting
 from leaderboard.reproduce.study import Row
@@ -36,9 +36,9 @@ def rows(setting: Setting) -> tuple[Row, ...]:
 
 def localized(setting: Setting) -> tuple[Row, ...]:
     """The same defenses on the queries of a place."""
-    task = places.task(setting)
+    task = scenes.task(setting)
     defenses = {subspaces(dim): table1.lifting(dim, setting) for dim in table1.DIMS}
-    defenses |= {private(epsilon): places.defense(setting, str(WORDS), str(epsilon), SUBSET) for epsilon in table4.EPSILONS}
+    defenses |= {private(epsilon): scenes.defense(setting, str(WORDS), str(epsilon), SUBSET) for epsilon in table4.EPSILONS}
     return tuple(
         Row(name=name, labels={}, paper={}, defense=defense, attack=None, task=task) for name, defense in defenses.items()
     )
@@ -49,7 +49,7 @@ def subspaces(dim: int) -> str:
 
 
 def private(epsilon: int) -> str:
-    return places.name(str(WORDS), str(epsilon), SUBSET)
+    return scenes.name(str(WORDS), str(epsilon), SUBSET)
 
 
 def recalls(scene: Scene) -> dict[str, float]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from leaderboard import repeated
+from leaderboard import multi_release
 from leaderboard.reproduce import scale
 from leaderboard.reproduce.drawing import Drawing, Scene
 
@@ -19,8 +19,8 @@ RELEASES = 8
 def drawn(scene: Scene) -> Iterator[tuple[str, Figure]]:
     factor = scene.setting.profile.scale
     for epsilon in EPSILONS:
-        curve = repeated.rows(scale.epsilon(epsilon, factor), scale.words(WORDS, factor), SUBSET, RELEASES)
-        yield f"epsilon{epsilon}", repeated.draw(curve)
+        curve = multi_release.rows(scale.epsilon(epsilon, factor), scale.words(WORDS, factor), SUBSET, RELEASES)
+        yield f"epsilon{epsilon}", multi_release.draw(curve)
 
 
 DRAWING = Drawing(name="repeated-releases", draw=drawn)

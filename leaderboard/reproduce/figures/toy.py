@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bench import registry
-from bench.features.dictionary import Dictionary
-from bench.features.sift import Sift
-from bench.kernels.search import unit_rows
-from bench.kernels.subspaces import nearest_to_subspaces
-from bench.plugin import Asset, DescriptorAttack, Lifting, View
-from bench.public import Public
+from bench.api import Asset, DescriptorAttack, Lifting, View
+from bench.codebook.dictionary import Dictionary
+from bench.codebook.public import Public
+from bench.extractors.sift import Sift
+from bench.geometry.nearest_words import unit_rows
+from bench.geometry.subspaces import nearest_to_subspaces
+from bench.registry import discovery
 from bench.types import Features, Floats, Indices, Knowledge, Subspaces
 from leaderboard.reproduce.drawing import Drawing, Scene
 from leaderboard.reproduce.study import build
@@ -62,8 +62,8 @@ def compute(seed: int = SEED) -> Toy:
     words = unit_rows(codes)
     d = unit_rows((curve(np.array([0.72])) + SPREAD * rng.normal(size=(1, 3))).astype(np.float32))  # (1, 3)
     secret = Features(keypoints=np.zeros((1, 2), np.float32), descriptors=d, codes=None, size=(1, 1))
-    defense = build(registry.DEFENSE, "affine", {"dim": 2, "sub_databases": 1, "database": Asset("toy")})
-    attack = build(registry.ATTACK, "database", {"neighbours": NEIGHBOURS, "estimators": ESTIMATORS})
+    defense = build(discovery.DEFENSE, "affine", {"dim": 2, "sub_databases": 1, "database": Asset("toy")})
+    attack = build(discovery.ATTACK, "database", {"neighbours": NEIGHBOURS, "estimators": ESTIMATORS})
     assert isinstance(defense, Lifting)
     assert isinstance(attack, DescriptorAttack)
     lifted = defense.lifted(secret, public, rng)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping
 
-from bench import registry
-from bench.plugin import Defense
+from bench.api import Defense
+from bench.registry import discovery
 from leaderboard.reproduce import published
 from leaderboard.reproduce.claims import Cell, Claim, Statement, at_least, falling, same_order
 from leaderboard.reproduce.profiles import Setting
@@ -27,8 +27,8 @@ def rows(setting: Setting) -> tuple[Row, ...]:
         name="raw",
         labels={"attack": "raw", "dim": "n/a"},
         paper=published.numbers(lines[-1], PRINTED),
-        defense=build(registry.DEFENSE, "none", {}),
-        attack=build(registry.ATTACK, "dia", {"weights": materials.raw_network}),
+        defense=build(discovery.DEFENSE, "none", {}),
+        attack=build(discovery.ATTACK, "dia", {"weights": materials.raw_network}),
         task=task,
     )
     where_there_are = {"weights": materials.affine_network, "database": materials.public_database, **setting.profile.reduced}
@@ -38,7 +38,7 @@ def rows(setting: Setting) -> tuple[Row, ...]:
             labels={"attack": line["attack"], "dim": line["dim"]},
             paper=published.numbers(line, PRINTED),
             defense=lifting(int(line["dim"]), setting),
-            attack=build(registry.ATTACK, line["attack"], {}, where_there_are),
+            attack=build(discovery.ATTACK, line["attack"], {}, where_there_are),
             task=task,
         )
         for line in lines[:-1]
@@ -48,7 +48,7 @@ def rows(setting: Setting) -> tuple[Row, ...]:
 
 def lifting(dim: int, setting: Setting) -> Defense:
     """The paper's hybrid lifting."""
-    return build(registry.DEFENSE, "affine", {"dim": dim, "database": setting.materials.database})
+    return build(discovery.DEFENSE, "affine", {"dim": dim, "database": setting.materials.database})
 
 
 def name(attack: str, dim: int | str) -> str:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from leaderboard.reproduce import places, published
+from leaderboard.reproduce import published, scenes
 from leaderboard.reproduce.claims import Cell, Claim, Statement, about_equal, at_least, falling, greater, same_order
-from leaderboard.reproduce.places import FULL, WITHIN, name
 from leaderboard.reproduce.profiles import Setting
+from leaderboard.reproduce.scenes import FULL, WITHIN, name
 from leaderboard.reproduce.study import Row, Table
 
 PRINTED = tuple(f"recall_{within}" for within in WITHIN)
@@ -22,7 +22,7 @@ ZERO = 2.0  # points of recall that are as good as none
 def rows(setting: Setting) -> tuple[Row, ...]:
     found: dict[str, Row] = {}  # the paper prints a row in each group that it belongs to; it is one row
     for line in published.lines("table2_localization_day"):
-        row = places.row(setting, line, published.numbers(line, PRINTED))
+        row = scenes.row(setting, line, published.numbers(line, PRINTED))
         found.setdefault(row.name, row)
     return tuple(found.values())
 
@@ -33,7 +33,7 @@ def cell(size: str, epsilon: str, subset: int, measure: str = MEASURE) -> Cell:
 
 def claims(paper: Mapping[Cell, float]) -> tuple[Claim, ...]:
     return (
-        same_order({key: value for key, value in paper.items() if key[1] == MEASURE}, places.APART, "points of recall"),
+        same_order({key: value for key, value in paper.items() if key[1] == MEASURE}, scenes.APART, "points of recall"),
         *about(MEASURE),
     )
 
@@ -101,10 +101,10 @@ def private_name() -> str:
 TABLE = Table(
     name="table2",
     title="Table 2: localization by day",
-    measures={**places.measures(recall="day"), **places.told("day")},
+    measures={**scenes.measures(recall="day"), **scenes.told("day")},
     rows=rows,
     claims=claims,
-    place=places.queried,
+    place=scenes.queried,
     ordered=MEASURE,
-    notes=places.NOTES,
+    notes=scenes.NOTES,
 )

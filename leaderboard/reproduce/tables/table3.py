@@ -8,10 +8,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
-from leaderboard.reproduce import places, published
+from leaderboard.reproduce import published, scenes
 from leaderboard.reproduce.claims import Cell, Claim, falling, greater, same_order
-from leaderboard.reproduce.places import WITHIN
 from leaderboard.reproduce.profiles import CPU, Setting
+from leaderboard.reproduce.scenes import WITHIN
 from leaderboard.reproduce.study import Row, Table
 
 PRINTED = tuple(f"recall_{within}" for within in WITHIN)
@@ -30,13 +30,13 @@ def rows(setting: Setting) -> tuple[Row, ...]:
     for line in published.lines("table3_ablation"):
         variable = line["variable"]
         dictionary = DICTIONARIES.get(variable, "references")
-        task = places.task(setting, matcher=MATCHERS.get(variable, "auto"), **_trials(setting, variable))
+        task = scenes.task(setting, matcher=MATCHERS.get(variable, "auto"), **_trials(setting, variable))
         found.append(
             Row(
                 name=variable,
-                labels={"ablation": line["ablation"], "variable": variable, **places.labels(setting, size, epsilon, subset)},
+                labels={"ablation": line["ablation"], "variable": variable, **scenes.labels(setting, size, epsilon, subset)},
                 paper=published.numbers(line, PRINTED),
-                defense=places.defense(setting, size, epsilon, subset, dictionary),
+                defense=scenes.defense(setting, size, epsilon, subset, dictionary),
                 attack=None,
                 task=task,
             )
@@ -46,7 +46,7 @@ def rows(setting: Setting) -> tuple[Row, ...]:
         name=RELEASED,
         labels={**found[0].labels, "ablation": "retrieval (ours)", "variable": "released words"},
         paper={},
-        task=places.task(setting, retrieval="released"),
+        task=scenes.task(setting, retrieval="released"),
     )
     return (*found, ours)
 
@@ -63,7 +63,7 @@ def claims(paper: Mapping[Cell, float]) -> tuple[Claim, ...]:
         return variable, MEASURE
 
     return (
-        same_order({key: value for key, value in paper.items() if key[1] == MEASURE}, places.APART, "points of recall"),
+        same_order({key: value for key, value in paper.items() if key[1] == MEASURE}, scenes.APART, "points of recall"),
         Claim(
             text="Matching by words beats mutual nearest neighbours by far.",
             statements=(greater(cell("voc-match"), cell("mutual-nn")),),
@@ -79,13 +79,13 @@ def claims(paper: Mapping[Cell, float]) -> tuple[Claim, ...]:
 TABLE = Table(
     name="table3",
     title="Table 3: ablations of localization by day",
-    measures={**places.measures(recall="day"), **places.told("day")},
+    measures={**scenes.measures(recall="day"), **scenes.told("day")},
     rows=rows,
     claims=claims,
-    place=places.queried,
+    place=scenes.queried,
     ordered=MEASURE,
     notes=(
-        *places.NOTES,
+        *scenes.NOTES,
         "The last row is ours, and no row of the paper: there, references are retrieved by the released words alone.",
     ),
 )

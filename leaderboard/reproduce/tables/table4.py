@@ -5,9 +5,9 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping
 
-from bench import registry
-from bench.errors import UserError
-from bench.public import Public
+from bench.codebook.public import Public
+from bench.core.errors import UserError
+from bench.registry import discovery
 from leaderboard.reproduce import published, scale
 from leaderboard.reproduce.claims import Cell, Claim, about_equal, falling, greater, same_order
 from leaderboard.reproduce.profiles import Setting
@@ -24,7 +24,7 @@ APART = 0.03  # SSIM; two cells nearer to each other than this are called about 
 
 def rows(setting: Setting) -> tuple[Row, ...]:
     materials, task, factor = setting.materials, reconstruction(setting), setting.profile.scale
-    dia = build(registry.ATTACK, "dia", {"weights": materials.ldp_network})
+    dia = build(discovery.ATTACK, "dia", {"weights": materials.ldp_network})
     found = []
     _check_size(setting)
     for line in published.lines("table4_ldp_inversion"):
@@ -38,7 +38,7 @@ def rows(setting: Setting) -> tuple[Row, ...]:
                 name=name(size, epsilon, subset),
                 labels=labels,
                 paper=published.numbers(line, PRINTED),
-                defense=build(registry.DEFENSE, "ldp", given),
+                defense=build(discovery.DEFENSE, "ldp", given),
                 attack=dia,
                 task=task,
             )

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from leaderboard.reproduce import places, published
+from leaderboard.reproduce import published, scenes
 from leaderboard.reproduce.claims import Cell, Claim, Statement, same_order
-from leaderboard.reproduce.places import WITHIN
 from leaderboard.reproduce.profiles import Setting
+from leaderboard.reproduce.scenes import WITHIN
 from leaderboard.reproduce.study import Row, Table
 from leaderboard.reproduce.tables import table2
 
@@ -17,7 +17,7 @@ DAY, NIGHT = ([f"{when}_{within}" for within in WITHIN] for when in ("day", "nig
 def rows(setting: Setting) -> tuple[Row, ...]:
     found: dict[str, Row] = {}
     for line in published.lines("tableS1_localization_day_night"):
-        row = places.row(setting, line, published.numbers(line, (*DAY, *NIGHT)))
+        row = scenes.row(setting, line, published.numbers(line, (*DAY, *NIGHT)))
         found.setdefault(row.name, row)
     return tuple(found.values())
 
@@ -25,8 +25,8 @@ def rows(setting: Setting) -> tuple[Row, ...]:
 def claims(paper: Mapping[Cell, float]) -> tuple[Claim, ...]:
     by_day, by_night = ({key: value for key, value in paper.items() if key[1] == measure[0]} for measure in (DAY, NIGHT))
     return (
-        same_order({**by_day}, places.APART, "points of recall by day"),
-        same_order({**by_night}, places.APART, "points of recall by night"),
+        same_order({**by_day}, scenes.APART, "points of recall by day"),
+        same_order({**by_night}, scenes.APART, "points of recall by night"),
         *table2.about(DAY[0]),
         Claim(
             text="Night is worse than day, in every row that localizes by day.",
@@ -44,10 +44,10 @@ def night_is_worse(row: str) -> Statement:
 TABLE = Table(
     name="tableS1",
     title="Table S1: localization by day and by night",
-    measures={**places.measures(day="day", night="night")},
+    measures={**scenes.measures(day="day", night="night")},
     rows=rows,
     claims=claims,
-    place=places.queried,
+    place=scenes.queried,
     ordered=DAY[0],
-    notes=places.NOTES,
+    notes=scenes.NOTES,
 )

@@ -10,16 +10,16 @@ import itertools
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
-from bench import registry
-from bench.features.sift import Sift
-from bench.plugin import Defense, Extractor
+from bench.api import Defense, Extractor
+from bench.extractors.sift import Sift
+from bench.registry import discovery
 from leaderboard.figures import Panel, draw
-from leaderboard.reproduce import places, published
+from leaderboard.reproduce import published, scenes
 from leaderboard.reproduce.claims import Cell, Claim, Statement, falling, greater, same_order
 from leaderboard.reproduce.drawing import Scene
-from leaderboard.reproduce.places import FULL
 from leaderboard.reproduce.profiles import Profile, Setting
 from leaderboard.reproduce.run import of
+from leaderboard.reproduce.scenes import FULL
 from leaderboard.reproduce.study import Measure, Row, Table, build
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ PRINTED |= {name: name for name in ("track_length", "reprojection_error")}
 def rows(setting: Setting) -> tuple[Row, ...]:
     lines = published.lines("tableS2_sfm")
     beside, other = ([line for line in lines if line["scene"] == scene] for scene in (BESIDE, OTHER))
-    task = build(registry.TASK, "structure", {"images": setting.profile.walk.views})
+    task = build(discovery.TASK, "structure", {"images": setting.profile.walk.views})
     return tuple(
         Row(
             name=name(line["dictionary_size"], line["epsilon"], int(line["subset_size"])),
@@ -56,11 +56,11 @@ def rows(setting: Setting) -> tuple[Row, ...]:
 
 
 def labels(setting: Setting, line: Mapping[str, str]) -> dict[str, str]:
-    return places.labels(setting, line["dictionary_size"], line["epsilon"], int(line["subset_size"]), setting.profile.walk_scale)
+    return scenes.labels(setting, line["dictionary_size"], line["epsilon"], int(line["subset_size"]), setting.profile.walk_scale)
 
 
 def defense(setting: Setting, size: str, epsilon: str, subset: int) -> Defense:
-    return places.defense(setting, size, epsilon, subset, factor=setting.profile.walk_scale)
+    return scenes.defense(setting, size, epsilon, subset, factor=setting.profile.walk_scale)
 
 
 def name(size: str, epsilon: str, subset: int) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from bench import registry
+from bench.registry import discovery
 from leaderboard.reproduce import published
 from leaderboard.reproduce.claims import Cell, Claim, falling, greater
 from leaderboard.reproduce.profiles import Setting
@@ -18,7 +18,7 @@ PRINTED = tuple(f"success_top{count}" for count in COUNTS)
 
 def rows(setting: Setting) -> tuple[Row, ...]:
     each = math.ceil(setting.profile.subspaces / setting.photographs)
-    task = build(registry.TASK, "intersections", {"subspaces": each})
+    task = build(discovery.TASK, "intersections", {"subspaces": each})
     return tuple(
         Row(
             name=f"dim {line['dim']}",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from bench import registry
+from bench.registry import discovery
 from leaderboard.reproduce import published
 from leaderboard.reproduce.claims import Cell, Claim, falling
 from leaderboard.reproduce.profiles import Setting
@@ -15,7 +15,7 @@ PRINTED = "no_collision_percent"
 
 
 def rows(setting: Setting) -> tuple[Row, ...]:
-    task = build(registry.TASK, "collisions", {"others": setting.profile.others})
+    task = build(discovery.TASK, "collisions", {"others": setting.profile.others})
     return tuple(
         Row(
             name=f"dim {line['dim']}",

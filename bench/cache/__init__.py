@@ -1,0 +1,1 @@
+"""Results that are stored under the hash of what they were computed from."""

@@ -1,0 +1,67 @@
+"""Digests of source, for keys: of modules and of all that they import of ours, and of nothing else.
+
+`environment.source_digest`, which records hold, is of everything that there is of ours; by it, a new metric would leave nothing
+to find again.
+"""
+
+from __future__ import annotations
+
+import ast
+import functools
+import hashlib
+import importlib.util
+from collections.abc import Iterator
+from importlib.abc import InspectLoader
+
+from bench.core.environment import PACKAGES
+
+
+@functools.cache
+def source(*modules: str) -> str:
+    """SHA-256 over the source of these modules, and of what they import of our packages and of their own."""
+    ours = {*PACKAGES, *(module.partition(".")[0] for module in modules)}
+    texts: dict[str, str] = {}
+    waiting = list(modules)
+    while waiting:
+        module = waiting.pop()
+        if module in texts or module.partition(".")[0] not in ours or (text := _text(module)) is None:
+            continue
+        texts[module] = text
+        waiting += _imported(module, text)
+    digest = hashlib.sha256()
+    for module in sorted(texts):
+        digest.update(f"{module} {hashlib.sha256(texts[module].encode()).hexdigest()}\n".encode())
+    return "sha256:" + digest.hexdigest()
+
+
+@functools.cache
+def _text(module: str) -> str | None:
+    """The source; None if there is no such module, or it has none."""
+    try:
+        spec = importlib.util.find_spec(module)
+    except (ImportError, ValueError):
+        return None
+    return spec.loader.get_source(module) if spec and isinstance(spec.loader, InspectLoader) else None
+
+
+def _imported(module: str, text: str) -> Iterator[str]:
+    """The names of modules that may be imported, at the top or later; not those for types alone."""
+    package = module if _is_package(module) else module.rpartition(".")[0]
+    waiting: list[ast.AST] = [ast.parse(text)]
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            waiting += node.orelse
+            continue
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = importlib.util.resolve_name("." * node.level + (node.module or ""), package)
+            yield base
+            yield from (f"{base}.{alias.name}" for alias in node.names)
+        waiting += ast.iter_child_nodes(node)
+
+
+def _is_package(module: str) -> bool:
+    spec = importlib.util.find_spec(module)
+    return spec is not None and spec.submodule_search_locations is not None

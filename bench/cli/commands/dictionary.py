@@ -1,0 +1,41 @@
+"""`bench dictionary build`: dictionaries of descriptors."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from bench.cli.terminal import DONE, add_extractor, add_seed, require, whole
+from bench.core.errors import UserError, unknown
+
+SUMMARY = "make dictionaries of descriptors: bench dictionary build"
+REQUIRED = ()
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("what", nargs="?", type=_what, metavar="build", help="cluster the descriptors of a folder")
+    parser.add_argument("--images", type=Path, metavar="DIR", help="a folder of photographs")
+    parser.add_argument("--size", type=whole, metavar="K", help="the number of words")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="the dictionary, a safetensors file")
+    add_seed(parser, "the clustering")
+    add_extractor(parser)
+
+
+def execute(args: argparse.Namespace) -> int:
+    from bench.codebook.build import build
+    from bench.registry import discovery, spec
+
+    if args.what is None:
+        raise UserError("say what to do with a dictionary: bench dictionary build")
+    require(args, ("images", "size", "out"), "dictionary build")
+
+    built = build(args.images, args.size, args.out, spec.read(args.extractor, discovery.EXTRACTOR), args.seed)
+    print(f"{args.out}: {len(built)} words from {built.meta['descriptors']} descriptors of {len(built.photographs)} photographs,")
+    print(f"mean cosine {built.meta['mean_cosine']:.4f}, {built.digest}")
+    return DONE
+
+
+def _what(text: str) -> str:
+    if text != "build":
+        raise unknown("command", f"dictionary {text}", ["dictionary build"])
+    return text

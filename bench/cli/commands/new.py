@@ -1,0 +1,34 @@
+"""`bench new`: a plugin of one's own."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from bench.cli.terminal import DONE
+
+SUMMARY = "write a small package with a plugin of your own and a passing test of the contract that it must keep"
+EPILOG = """What is written works, does little, and is yours to change.
+
+examples:
+  bench new defense my-defense
+  pip install -e my-defense && pytest my-defense
+  bench run --defense my-defense --attack keypoints
+"""
+REQUIRED = ("kind", "name")
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("kind", nargs="?", metavar="KIND", help="defense, attack, metric, task, extractor or dataset")
+    parser.add_argument("name", nargs="?", metavar="NAME", help="small letters, digits and -")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="a new folder (default: called as the plugin)")
+
+
+def execute(args: argparse.Namespace) -> int:
+    from bench.registry import scaffold
+
+    out = args.out or Path(args.name)
+    for path in scaffold.write(args.kind, args.name, out):
+        print(path)
+    print(f"next: pip install -e {out} && pytest {out}")
+    return DONE

@@ -1,0 +1,1 @@
+"""Dictionaries and databases of descriptors: build, load, quantise."""

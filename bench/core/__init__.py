@@ -1,0 +1,1 @@
+"""What everything else may use: errors, exact numbers, devices, threads, randomness, progress, the environment."""

@@ -1,0 +1,1 @@
+"""Extractors, one file each, which sets `PLUGIN`."""

@@ -1,0 +1,95 @@
+"""HardNet descriptors (Mishchuk et al., NeurIPS 2017) of upright SIFT keypoints, through kornia (`pip install kornia`).
+
+Nothing is downloaded. The weights are kornia's `checkpoint_liberty_with_aug.pth`: a file that is named, or where torch.hub
+keeps it (`torch.hub.get_dir()`/checkpoints) after `kornia.feature.HardNet(pretrained=True)` was called once.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bench.api import Extractor
+from bench.core.errors import UserError
+from bench.extractors.sift import Sift
+from bench.geometry.nearest_words import unit_rows
+from bench.types import Features, Floats
+
+HUB = Path("hub")
+WEIGHTS = "checkpoint_liberty_with_aug.pth"
+RADIUS = 3.0  # of a patch, in diameters of a keypoint: six standard deviations, as of SIFT's own window and in kornia
+BATCH = 256  # patches at a time
+
+
+@dataclass(frozen=True, kw_only=True)
+class HardNet(Extractor):
+    """HardNet at upright SIFT's keypoints."""
+
+    weights: Path  # kornia's file, or `hub` for where torch.hub keeps it; records hold the content's digest
+    max_keypoints: int = 1000  # those of strongest response
+
+    def __post_init__(self) -> None:
+        if self.weights == HUB:
+            object.__setattr__(self, "weights", _kept())
+        if not self.weights.is_file():
+            raise UserError(f"hardnet: {self.weights}: no such file")
+        if self.max_keypoints < 1:
+            raise UserError(f"hardnet: max_keypoints must be at least 1, got {self.max_keypoints}")
+
+    def extract(self, image: np.ndarray, source: Path | None = None) -> Features:
+        found = Sift(max_keypoints=self.max_keypoints).extract(image, source)
+        assert found.frames is not None
+        rows = _described(image, found.keypoints, found.frames[:, 0], self.weights)
+        keep = np.asarray(rows.any(axis=1))
+        return dataclasses.replace(found, descriptors=unit_rows(rows), codes=None).take(keep)
+
+
+def _kept() -> Path:
+    import torch
+
+    folder = Path(torch.hub.get_dir()) / "checkpoints"
+    kept = sorted(folder.glob(f"*{WEIGHTS}"))  # kornia puts the name of its repository before
+    if not kept:
+        raise UserError(
+            f"hardnet: no {WEIGHTS} in {folder}; call kornia.feature.HardNet(pretrained=True) once, or give weights=FILE"
+        )
+    return kept[0]
+
+
+def _described(image: np.ndarray, keypoints: Floats, diameters: Floats, path: Path) -> Floats:
+    """(H, W, 3), (N, 2), (N,) -> (N, 128)"""
+    import torch
+
+    kornia, network = _network(path, path.stat().st_mtime_ns)
+    grey = kornia.color.rgb_to_grayscale(torch.from_numpy(image.transpose(2, 0, 1).copy())[None].float() / 255)  # (1, 1, H, W)
+    centres = torch.from_numpy(keypoints - np.float32(0.5))[None]  # kornia's centre of the first pixel is (0, 0)
+    scales = torch.from_numpy(diameters * np.float32(RADIUS))[None, :, None, None]
+    frames = kornia.feature.laf_from_center_scale_ori(centres, scales)  # (1, N, 2, 3)
+    with torch.inference_mode():
+        patches = kornia.feature.extract_patches_from_pyramid(grey, frames, network.patch_size)[0]  # (N, 1, 32, 32)
+        return np.asarray(torch.cat([network(batch) for batch in patches.split(BATCH)]).numpy())
+
+
+@lru_cache(maxsize=2)
+def _network(path: Path, changed: int) -> tuple[Any, Any]:
+    """kornia, and its network with the weights of a file as it was at that time."""
+    import torch
+
+    try:
+        import kornia
+    except ImportError:
+        raise UserError("hardnet needs kornia: pip install 'feature-privacy-bench[hardnet]'") from None
+    network = kornia.feature.HardNet(pretrained=False)
+    try:
+        network.load_state_dict(torch.load(path, map_location="cpu", weights_only=True)["state_dict"])
+    except Exception as error:  # whatever torch raises of a file that is something else
+        raise UserError(f"hardnet: {path}: not kornia's {WEIGHTS} ({type(error).__name__})") from None
+    return kornia, network.eval()
+
+
+PLUGIN = HardNet

@@ -1,0 +1,93 @@
+"""SIFT through OpenCV, upright unless told otherwise (Lowe, IJCV 2004)."""
+
+from __future__ import annotations
+
+import math
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from bench.api import Extractor
+from bench.core.errors import UnitError, UserError
+from bench.geometry.nearest_words import unit_rows
+from bench.types import Features, Indices
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sift(Extractor):
+    """SIFT; upright by default: one orientation, gravity's, and each point once.
+
+    Orientation is never released. An upright descriptor tells the attacker where its edges point; an oriented one
+    (`upright=false`, the paper's) leaves that to be inferred.
+    """
+
+    exact_zeros = True
+    eight_bit = True
+
+    upright: bool = True
+    contrast_threshold: float = 0.002  # lower than OpenCV's .04: 256 x 256 pixels shall give about 600 to 1,000 keypoints
+    edge_threshold: float = 15.0
+    max_keypoints: int = 1000  # those of strongest response
+
+    def __post_init__(self) -> None:
+        if self.contrast_threshold < 0 or self.edge_threshold <= 0 or self.max_keypoints < 1:
+            raise UserError("sift: thresholds must be positive and max_keypoints at least 1")
+
+    def extract(self, image: np.ndarray, source: Path | None = None) -> Features:
+        import cv2
+
+        sift = cv2.SIFT_create(  # type: ignore[attr-defined]
+            contrastThreshold=self.contrast_threshold, edgeThreshold=self.edge_threshold, enable_precise_upscale=True
+        )
+        grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        points = sift.detect(grey, None)
+        if self.upright:
+            points = _once_each(points)
+        # Strongest first; equal responses in the order of their positions, so that the cut is reproducible.
+        points = sorted(points, key=lambda p: (-p.response, p.pt, p.size, p.angle))[: self.max_keypoints]
+        if not points:
+            raise UnitError("no keypoint was found: is the image flat?")
+        points, values = sift.compute(grey, points)
+        codes = values.astype(np.uint8)  # OpenCV rounds to 0..255 and hands them out as float32
+        xy = np.array([point.pt for point in points], dtype=np.float32) + 0.5  # OpenCV's centre of the first pixel is 0
+        frames = np.array([(point.size, math.radians(point.angle)) for point in points], dtype=np.float32)  # (N, 2)
+        keep = codes.any(axis=1)
+        height, width = grey.shape
+        found = Features(
+            keypoints=xy[keep], descriptors=unit_rows(codes[keep]), codes=codes[keep], size=(width, height), frames=frames[keep]
+        )
+        return found.by_position()
+
+    def mirror_order(self) -> Indices:
+        """Upright: columns of the 4 x 4 histograms change places, and angle a becomes π - a. Oriented: rows, and -a."""
+        row, column, angle = np.indices((4, 4, 8))
+        if self.upright:
+            column, angle = 3 - column, (4 - angle) % 8
+        else:  # the frame turns with the photograph
+            row, angle = 3 - row, -angle % 8
+        order: Indices = ((row * 4 + column) * 8 + angle).ravel()
+        return order
+
+    def turn_order(self) -> Indices:
+        """Upright: columns of the histograms become rows from below, and angle a becomes a + π / 2. Oriented: as it was."""
+        row, column, angle = np.indices((4, 4, 8))
+        if self.upright:
+            row, column, angle = column, 3 - row, (angle - 2) % 8
+        order: Indices = ((row * 4 + column) * 8 + angle).ravel()
+        return order
+
+    def unlimited(self) -> Extractor:
+        return replace(self, max_keypoints=sys.maxsize)
+
+
+def _once_each(points: list) -> list:
+    """Drop the repetitions of a point that differ in orientation only, and fix the orientation."""
+    unique = {(point.pt, point.size): point for point in points}
+    for point in unique.values():
+        point.angle = 0.0
+    return list(unique.values())
+
+
+PLUGIN = Sift

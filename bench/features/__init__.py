@@ -1,1 +1,0 @@
-"""Extractors, one file each, and dictionaries of descriptors."""

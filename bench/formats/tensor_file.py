@@ -1,0 +1,100 @@
+"""Safetensors files that carry what they are and a digest of all they hold, verified at every load."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bench.core.errors import UserError
+
+Arrays = dict[str, np.ndarray]
+
+
+def content_digest(kind: str, arrays: Arrays, meta: dict[str, Any]) -> str:
+    """SHA-256 over the kind, the metadata and every array's name, dtype, shape and bytes."""
+    digest = hashlib.sha256(json.dumps([kind, meta], sort_keys=True, allow_nan=False).encode())
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        digest.update(f"{name} {array.dtype} {array.shape}".encode())
+        digest.update(array.data)
+    return "sha256:" + digest.hexdigest()
+
+
+def halved(array: np.ndarray) -> np.ndarray:
+    """In half precision, or as it is where that has no such numbers: a batch norm's variance may well be above 65,504."""
+    with np.errstate(over="ignore"):
+        half = array.astype(np.float16)
+    return half if np.isfinite(half).all() else array
+
+
+def save(path: Path, kind: str, arrays: Arrays, meta: dict[str, Any]) -> str:
+    """Write the file in one step (a crash leaves the old one) and return its digest."""
+    from safetensors.numpy import save as serialized
+
+    digest = content_digest(kind, arrays, meta)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_name(f"{path.name}.{os.getpid()}.unfinished")  # others may be writing the same
+    header = {"kind": kind, "digest": digest, "meta": json.dumps(meta, sort_keys=True, allow_nan=False)}
+    content = serialized({name: np.ascontiguousarray(array) for name, array in arrays.items()}, header)
+    try:
+        unfinished.write_bytes(content)
+        unfinished.replace(path)
+    except OSError:
+        unfinished.unlink(missing_ok=True)
+        raise
+    return digest
+
+
+def load(path: Path, kind: str) -> tuple[Arrays, dict[str, Any], str]:
+    """Return the arrays, the metadata and the digest.
+
+    Raises
+    ------
+    UserError
+        if there is no such file, it is of another kind, or its content is not what was written.
+    """
+    arrays, header = _read(path)
+    if header.get("kind") != kind:
+        raise UserError(f"{path}: holds {header.get('kind', 'something else')!s}, not {kind}")
+    return arrays, *_checked(path, arrays, header)
+
+
+def verify(path: Path) -> None:
+    """Read a file of whatever kind.
+
+    Raises
+    ------
+    UserError
+        if there is no such file, or its content is not what was written.
+    """
+    arrays, header = _read(path)
+    if not {"kind", "digest", "meta"} <= header.keys():
+        raise UserError(f"{path}: has no checksum")
+    _checked(path, arrays, header)
+
+
+def _read(path: Path) -> tuple[Arrays, dict[str, str]]:
+    from safetensors import SafetensorError, safe_open
+
+    if not path.is_file():
+        raise UserError(f"{path}: no such file")
+    try:
+        with safe_open(path, framework="numpy") as opened:
+            header = opened.metadata() or {}
+            return {name: opened.get_tensor(name) for name in opened.keys()}, header  # noqa: SIM118 (it is no mapping)
+    except (SafetensorError, OSError) as error:
+        raise UserError(f"{path}: not a whole safetensors file: {error}") from error
+
+
+def _checked(path: Path, arrays: Arrays, header: dict[str, str]) -> tuple[dict[str, Any], str]:
+    """The metadata and the digest."""
+    meta = json.loads(header["meta"])
+    digest = content_digest(header["kind"], arrays, meta)
+    if digest != header.get("digest"):
+        raise UserError(f"{path}: its checksum is {digest}, but {header.get('digest')} was written; fetch or build it again")
+    return meta, digest

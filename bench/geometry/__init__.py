@@ -1,0 +1,1 @@
+"""Nearest words, affine subspaces and their intersections: pure functions of arrays."""

@@ -1,0 +1,1 @@
+"""Photographs, their views, scenes, and the samples that records are about."""

@@ -1,0 +1,152 @@
+"""The inversion network: an MLP embeds each keypoint, embeddings are scattered to a grid, a U-Net paints the photograph.
+
+After Pittaluga et al. (CVPR 2019) and Dosovitskiy and Brox (CVPR 2016), made small: the grid has one cell for 4 x 4 pixels, a
+keypoint's place within its cell being an input of its embedding, and most channels are where cells are few. Each keypoint also
+paints a patch around itself, as wide as what its descriptor has seen, which no convolution of a sparse map does as soon.
+
+The rule for keypoints that share a cell: their embeddings are added up, and a channel of its own counts them; so are patches.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as nnf
+from torch import Tensor, nn
+
+from bench.inversion.encoding import CELL, Points
+
+COARSENET = (256, 256, 256, 512, 512, 512)  # its encoder's channels (Pittaluga et al., CVPR 2019)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shape:
+    """The network's sizes."""
+
+    inputs: int  # numbers a keypoint
+    candidates: int = 0  # how many of them are embedded one by one and added up; 0: all numbers are embedded together
+    length: int = 0  # of one of these candidates
+    hidden: int = 256  # width of the embedding MLP
+    widths: tuple[int, ...] = (32, 64, 112, 112)  # channels at 1/4, 1/8, ... of the image's side
+    last: int = 32  # channels at 1/2
+    patch: int = 6  # cells: the side of what a keypoint paints around itself
+    painted: int = 16  # channels of that
+
+
+class Inverter(nn.Module):
+    """Points of B releases -> (B, 3, H, W) RGB, unclamped."""
+
+    def __init__(self, shape: Shape) -> None:
+        super().__init__()
+        first = shape.widths[0]
+        self.shape = shape
+        self.embed = nn.Sequential(
+            nn.Linear(shape.inputs - max(0, shape.candidates - 1) * shape.length, shape.hidden),
+            nn.SiLU(inplace=True),
+            nn.Linear(shape.hidden, shape.hidden),
+            nn.SiLU(inplace=True),
+        )
+        self.own = nn.Linear(shape.hidden, first - 1)
+        self.around = nn.Linear(shape.hidden, shape.patch**2 * shape.painted)
+        self.stem = conv_norm(first + shape.painted, first)
+        pairs = list(itertools.pairwise(shape.widths))
+        self.down = nn.ModuleList(nn.Sequential(conv_norm(narrow, wide, stride=2), Residual(wide)) for narrow, wide in pairs)
+        self.up = nn.ModuleList(Up(wide, narrow) for narrow, wide in reversed(pairs))
+        self.narrow = nn.Conv2d(first, shape.last, 1)
+        self.refine = conv_norm(shape.last, shape.last)
+        self.paint = nn.Conv2d(shape.last, 3 * (CELL // 2) ** 2, 3, padding=1)
+
+    def forward(self, points: Points) -> Tensor:
+        rows, columns = points.grid
+        step = 2 ** len(self.down)  # of the deepest level's grid; an image of another size is painted with an empty margin
+        margin = (0, -columns % step, 0, -rows % step)
+        level = self.stem(nnf.pad(self.scatter(points), margin))
+        levels = [level]
+        for down in self.down:
+            levels.append(down(levels[-1]))
+        level = levels.pop()
+        for up in self.up:
+            level = up(level, levels.pop())
+        halved = self.refine(doubled(self.narrow(level)))
+        painted = nnf.pixel_shuffle(self.paint(halved).float(), CELL // 2) + 0.5
+        return painted[:, :, : points.size[0], : points.size[1]]  # (B, 3, H, W)
+
+    def scatter(self, points: Points) -> Tensor:
+        """What keypoints say of their cells and of those around them. -> (B, first + painted, H/4, W/4), channels last"""
+        hidden = self.embedded(points)
+        own = self.own(hidden)
+        counted = torch.cat([own, torch.ones_like(own[:, :1])], dim=1)
+        cells = added_up(counted, points.image, points.places.long(), (points.batch, *points.grid))
+        return torch.cat([cells, self.patches(hidden, points)], dim=3).permute(0, 3, 1, 2)
+
+    def patches(self, hidden: Tensor, points: Points) -> Tensor:
+        """The patches around keypoints, in cells. What lies outside of the image is lost. -> (B, H/4, W/4, painted)"""
+        side, (rows, columns) = self.shape.patch, points.grid
+        corner = (points.places + (side + 1) / 2).long()  # (P, 2) in a grid with a margin, as wide as a patch, on all sides
+        steps = torch.arange(side, device=corner.device)
+        row, column = corner[:, 1, None, None] + steps[:, None], corner[:, 0, None, None] + steps  # (P, side, 1), (P, 1, side)
+        cells = torch.stack(torch.broadcast_tensors(column, row), dim=3).view(-1, 2)
+        painted = self.around(hidden).view(-1, self.shape.painted)  # (P side side, painted)
+        shape = points.batch, rows + 2 * side, columns + 2 * side
+        grid = added_up(painted, points.image.repeat_interleave(side * side), cells, shape)
+        return grid[:, side : side + rows, side : side + columns]
+
+    def embedded(self, points: Points) -> Tensor:
+        """What is made of each keypoint. -> (P, hidden)"""
+        return self.embed_set(points.values) if self.shape.candidates else self.embed(points.values)
+
+    def embed_set(self, values: Tensor) -> Tensor:
+        """Embed each candidate with what goes for all, and add up: their order says nothing. (P, F) -> (P, hidden)"""
+        count, length = self.shape.candidates, self.shape.length
+        candidates = values[:, : count * length].view(-1, count, length)  # (P, m, D)
+        common = values[:, None, count * length :].expand(-1, count, -1)
+        hidden = self.embed(torch.cat([candidates, common], dim=2))  # (P, m, hidden)
+        there = candidates.any(dim=2)[..., None]  # the others are padding
+        return (hidden * there).sum(dim=1) / there.sum(dim=1).clamp(min=1).sqrt()
+
+
+def conv_norm(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(inputs, outputs, 3, stride=stride, padding=1, bias=False),
+        nn.BatchNorm2d(outputs),
+        nn.ReLU(inplace=True),
+    )
+
+
+class Residual(nn.Module):
+    """x + conv(conv(x)), (B, C, H, W) -> the same."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.first = conv_norm(channels, channels)
+        self.second = nn.Sequential(nn.Conv2d(channels, channels, 3, padding=1, bias=False), nn.BatchNorm2d(channels))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return nnf.relu(x + self.second(self.first(x)))
+
+
+class Up(nn.Module):
+    """Doubles the resolution and adds the encoder's level of that resolution: half of the operations of joining it."""
+
+    def __init__(self, wide: int, narrow: int) -> None:
+        super().__init__()
+        self.narrow = nn.Conv2d(wide, narrow, 1)
+        self.join = conv_norm(narrow, narrow)
+        self.refine = conv_norm(narrow, narrow)
+
+    def forward(self, deep: Tensor, skip: Tensor) -> Tensor:
+        return self.refine(self.join(doubled(self.narrow(deep)) + skip))
+
+
+def doubled(level: Tensor) -> Tensor:
+    """(B, C, H, W) -> (B, C, 2 H, 2 W)"""
+    return nnf.interpolate(level, scale_factor=2.0, mode="nearest")
+
+
+def added_up(values: Tensor, image: Tensor, cells: Tensor, shape: tuple[int, int, int]) -> Tensor:
+    """Values (P, C) of each image's cells (P, 2), column and row, added up in a grid. -> (*shape, C)"""
+    batch, rows, columns = shape
+    places = (image * rows + cells[:, 1]) * columns + cells[:, 0]
+    return values.new_zeros(batch * rows * columns, values.shape[1]).index_add(0, places, values).view(*shape, -1)

@@ -1,1 +1,0 @@
-"""Numerical kernels that several plugins share: pure functions of arrays."""

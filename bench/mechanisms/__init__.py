@@ -1,0 +1,1 @@
+"""Exact samplers of local differential privacy, composition, budgets, subset size, and `protect`."""

@@ -1,0 +1,1 @@
+"""Runs experiments: plan, trial, execute, engines, the attack process, the run directory, records."""

@@ -1,0 +1,75 @@
+"""Workers on many machines, under a scheduler of dask.distributed. `docs/sweeps.md` says how to start them."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Iterator
+from concurrent.futures import CancelledError
+from typing import TYPE_CHECKING, Any
+
+from bench.core.errors import UserError
+from bench.runner import trial
+from bench.runner.engines import Engine, Job, first_come, letter, worker
+from bench.runner.trial import Made
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+AHEAD = 2  # jobs for each worker: one that it does, and one that lies ready
+THREADS = 1  # of a worker: there is one for each core
+PATIENCE = 60.0  # seconds until the scheduler and a first worker must have answered
+
+
+class Cluster(Engine):
+    """The workers of a scheduler. A job is a task of dask's, known by the job's hash; a lost worker's jobs are done by others."""
+
+    name = "dask"
+
+    def __init__(self, scheduler: str) -> None:
+        self._scheduler = scheduler
+
+    def describe(self, plugins: Iterable[object]) -> dict[str, Any]:
+        with self._client() as client:
+            try:
+                client.wait_for_workers(1, timeout=PATIENCE)
+            except TimeoutError:
+                raise UserError(f"--scheduler {self._scheduler}: it has no workers") from None
+            several = [address for address, count in client.nthreads().items() if count != 1]
+            if several:
+                raise UserError(f"worker {several[0]} does several jobs at once; start workers with --nthreads 1")
+            found = client.run(worker.described, list(plugins), THREADS)
+        (first, told), *others = found.items()
+        for address, other in others:
+            for name in told:
+                if other.get(name) != told[name]:
+                    raise UserError(f"workers differ in {name}: {first} has {told[name]}, {address} has {other.get(name)}")
+        return told
+
+    def __call__(self, jobs: Iterator[Job]) -> Iterator[Made]:
+        from distributed import KilledWorker
+
+        with self._client() as client, client.get_executor() as executor:
+            submitted = first_come(
+                lambda job: executor.submit(worker.carry_out, letter(job, THREADS), key=job.name),
+                lambda: AHEAD * max(1, len(client.nthreads())),  # workers come and go
+                jobs,
+            )
+            for job, future in submitted:
+                try:
+                    yield future.result()
+                except CancelledError:
+                    raise UserError(f"--scheduler {self._scheduler}: the scheduler was lost; run again to go on") from None
+                except KilledWorker:
+                    reason = "every worker that began this ended, perhaps for want of memory"
+                    yield Made(record=trial.record(job.cell, job.unit, status="failed", reason=reason))
+
+    def _client(self) -> Client:
+        try:
+            from distributed import Client
+        except ImportError:
+            raise UserError("--engine dask needs distributed: pip install 'feature-privacy-bench[dask]'") from None
+        logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # what matters of it is told by our errors
+        try:
+            return Client(self._scheduler, timeout=PATIENCE, set_as_default=False)
+        except (OSError, ValueError) as error:
+            raise UserError(f"--scheduler {self._scheduler}: no scheduler answers there ({error})") from None

@@ -1,0 +1,152 @@
+"""How far a run is, told by its folder alone: by the plan, the records, and what its writer has in hand."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from bench.runner import directory, records
+from bench.runner.records import EVERY_UNIT, Record
+
+if TYPE_CHECKING:
+    from rich.table import Table
+    from rich.text import Text
+
+
+@dataclass(frozen=True, kw_only=True)
+class Count:
+    """Units by how far they are. Each is one of these."""
+
+    done: int = 0
+    running: int = 0  # in the hand of a process that lives
+    failed: int = 0  # and tried again by the next run
+    missing: int = 0
+
+    def __add__(self, other: Count) -> Count:
+        both = zip(dataclasses.astuple(self), dataclasses.astuple(other), strict=True)
+        return Count(**{field.name: sum(pair) for field, pair in zip(dataclasses.fields(self), both, strict=True)})
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CellStatus:
+    """How far a cell is."""
+
+    head: Mapping[str, Any]  # what its records begin with
+    count: Count
+    reason: str | None  # why it does not apply, if it does not
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Status:
+    """How far the last plan of a folder is."""
+
+    cells: tuple[CellStatus, ...]
+    other: int  # records of other plans, or of other source, libraries or machines
+    writer: Mapping[str, Any] | None  # who is at work, or was when it ended without notice
+    alive: bool  # whether somebody is
+
+    @property
+    def count(self) -> Count:
+        """Of all cells that apply."""
+        return sum((cell.count for cell in self.cells if cell.reason is None), Count())
+
+    @property
+    def inapplicable(self) -> int:
+        """Cells that do not apply."""
+        return sum(cell.reason is not None for cell in self.cells)
+
+
+def status(out: Path) -> Status:
+    """How far that folder's run is.
+
+    Raises
+    ------
+    UserError
+        if nothing was run there, or a file of it is damaged.
+    """
+    plans = directory.read_plan(out)
+    file = out / records.FILE
+    found = {records.key(record): record for record in (records.read(file).records if file.is_file() else ())}
+    alive, writer = records.locked(file), directory.read_hand(out)
+    in_hand = {(run_hash, unit) for run_hash, unit in (writer or {}).get("jobs", ())} if alive else set()
+    cells = {}
+    for plan in plans:
+        for cell in plan["cells"]:
+            states = Counter(_state((cell["run_hash"], unit), found, in_hand) for unit in plan["units"])
+            count = Count() if cell["reason"] else Count(**states)
+            cells[cell["run_hash"]] = CellStatus(head=cell, count=count, reason=cell["reason"])
+    planned = {(cell["run_hash"], unit) for plan in plans for cell in plan["cells"] for unit in (*plan["units"], EVERY_UNIT)}
+    return Status(cells=tuple(cells.values()), other=len(found.keys() - planned), writer=writer, alive=alive)
+
+
+def shown(out: Path) -> Iterator[Table | Text]:
+    """The status of a folder for a terminal.
+
+    Raises
+    ------
+    UserError
+        as `status`.
+    """
+    from rich.table import Table
+    from rich.text import Text
+
+    from leaderboard.tables import labels
+
+    found = status(out)
+    names = labels([(cell.head["defense"], cell.head["attack"]) for cell in found.cells])
+    yield Text(f"{out}: {told(found)}")
+    table = Table()
+    for column in ("task", "defense", "attack", "seed", "done", "running", "failed", "missing", "n/a"):
+        table.add_column(column, overflow="fold", justify="left" if column in ("task", "defense", "attack", "n/a") else "right")
+    for cell, (defense, attack) in zip(found.cells, names, strict=True):
+        counts = ["n/a"] * 4 if cell.reason else list(map(str, dataclasses.astuple(cell.count)))
+        row = (cell.head["task"], defense, attack, str(cell.head["seed"]), *counts, cell.reason or "")
+        table.add_row(*map(Text, row))
+    yield table
+
+
+def overview(folder: Path) -> Table:
+    """The status of every run in a folder, one a line."""
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(title=Text(str(folder)), title_justify="left")
+    for column in ("run", "status"):
+        table.add_column(column, overflow="fold")
+    for plan in sorted(folder.glob(f"*/{directory.PLAN}")):
+        table.add_row(Text(plan.parent.name), Text(told(status(plan.parent))))
+    return table
+
+
+def told(found: Status) -> str:
+    """A status in one line."""
+    count = found.count
+    parts = [
+        f"{count.done} done, {count.running} running, {count.failed} failed, {count.missing} missing",
+        f"{found.inapplicable} pairs n/a" if found.inapplicable else "",
+        *([f"{found.other} records of other runs"] if found.other else []),
+        _writer(found),
+    ]
+    return "; ".join(part for part in parts if part)
+
+
+def _writer(found: Status) -> str:
+    if found.writer is None:
+        return "" if not found.alive else "beginning"
+    since = datetime.fromtimestamp(found.writer["since"])
+    who = f"{found.writer['engine']} of process {found.writer['pid']} on {found.writer['host']}, since {since:%Y-%m-%d %H:%M}"
+    return f"running: {who}" if found.alive else f"ended without notice: {who}; run it again to go on"
+
+
+def _state(key: tuple[str, str], found: Mapping[tuple[str, str], Record], in_hand: set[tuple[str, str]]) -> str:
+    record = found.get(key)
+    if record is not None and record["status"] != "failed":
+        return "done"
+    if key in in_hand:
+        return "running"
+    return "missing" if record is None else "failed"

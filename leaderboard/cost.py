@@ -1,0 +1,166 @@
+"""What a service costs: operations, bytes and seconds of a query, from counts and from rates that are measured here.
+
+Times are of one core (`time.process_time`, one thread), so that what else runs on the machine counts little, and add up to cores:
+seconds of a query times queries a day, divided by the seconds of a day.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from bench.api import Extractor, ImageAttack, View
+from bench.codebook.public import Public
+from bench.geometry.nearest_words import WordIndex
+from bench.geometry.subspaces import nearest_to_subspaces
+from bench.images import photographs
+from bench.mechanisms.subset import word_subsets
+from bench.registry import discovery, spec
+from bench.tasks.reconstruction import offered
+from bench.types import Features, Subspaces
+
+DAY = 86_400  # seconds
+POSITION = 8  # bytes of two float32
+WORD = 4  # bytes of a word's number
+FLOAT = 4
+LEAST = 0.2  # seconds that a rate is measured for, at least
+
+
+@dataclass(frozen=True, kw_only=True)
+class Service:
+    """Sizes. The defaults are the paper's, where it states them."""
+
+    keypoints: int = 1000  # of an image; the paper does not say
+    words: int = 256_000  # |K|
+    subset_size: int = 2  # m of LDP-Feat
+    dim: int = 4  # of a subspace
+    database: int = 256_000  # |W| of lifting, which the database attack searches
+    references: int = 20  # images that a query is matched to
+    length: int = 128  # of a descriptor, D
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rates:
+    """What one core does here."""
+
+    search: float  # operations a second of the search for the nearest word
+    subspaces: float  # operations a second of the search for the words nearest to subspaces
+    sets: float  # sets drawn a second
+    extraction: float  # seconds a photograph of 256 x 256
+    lifting: float  # seconds a keypoint
+    painting: float  # seconds a photograph of 256 x 256
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cost:
+    """One step of a query; None where it has no such number."""
+
+    who: str
+    step: str
+    operations: float | None = None
+    sent: int | None = None  # bytes
+    seconds: float | None = None
+
+
+def measure(service: Service) -> Rates:
+    """Measure the rates on a photograph that scikit-image carries, with one thread. Takes seconds to a minute.
+
+    Raises
+    ------
+    UserError
+        if this installation lacks its dictionaries or networks.
+    """
+    import torch
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        return _measured(service)
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _measured(service: Service) -> Rates:
+    public = Public()
+    rng = np.random.default_rng(0)
+    pixels = photographs.read(photographs.builtin()[0].path).pixels
+    extractor = spec.read("sift", discovery.EXTRACTOR)
+    secret = extractor.extract(pixels)
+    few = secret.take(np.arange(min(len(secret), 128)))
+    known, database = public.dictionary("shipped").first(service.words), public.dictionary("shipped").first(service.database)
+    index = WordIndex(known.words)
+    assert few.codes is not None
+    codes = few.codes
+    lifting = spec.read(f"affine:dim={service.dim}", discovery.DEFENSE)
+    release = lifting.protect(few, public, rng)
+    assert isinstance(release, Subspaces)
+    true = rng.integers(len(known), size=10_000)
+    size = 2.0 * len(few) * service.length
+    return Rates(
+        search=size * len(known) / _seconds(lambda: index.nearest(codes)),
+        subspaces=size * (service.dim + 1) * len(database) / _seconds(lambda: nearest_to_subspaces(release, database.words, 8)),
+        sets=len(true) / _seconds(lambda: word_subsets(true, len(known), 10.0, service.subset_size, rng)),
+        extraction=_seconds(lambda: extractor.extract(pixels)),
+        lifting=_seconds(lambda: lifting.protect(few, public, rng)) / len(few),
+        painting=_painting(secret, extractor, public),
+    )
+
+
+def _painting(secret: Features, extractor: Extractor, public: Public) -> float:
+    attack, defense = spec.read("dia", discovery.ATTACK), spec.read("none", discovery.DEFENSE)
+    assert isinstance(attack, ImageAttack)
+    release = defense.protect(secret, public, np.random.default_rng(0))
+    view = View(release=release, defense=defense, extractor=extractor, knowledge=offered(attack, defense, public))
+    return _seconds(lambda: attack.reconstruct(view, np.random.default_rng(0)))
+
+
+def _seconds(work: Callable[[], object]) -> float:
+    """Of the processor, the shortest of several runs; the first, which may fill caches, does not count."""
+    work()
+    taken: list[float] = []
+    while sum(taken) < LEAST or len(taken) < 3:
+        started = time.process_time()
+        work()
+        taken.append(time.process_time() - started)
+    return max(min(taken), 1e-9)
+
+
+def query(service: Service, rates: Rates) -> Iterator[Cost]:
+    """The steps of one query, on the phone, on the way, on the server, and of an attacker."""
+    n, d, m, dim = service.keypoints, service.length, service.subset_size, service.dim
+    search = 2.0 * n * service.words * d
+    matching = 2.0 * service.references * n * n * d
+    attack = 2.0 * n * (dim + 1) * service.database * d
+    yield Cost(who="phone", step="extract SIFT, 256 x 256", seconds=rates.extraction)
+    yield Cost(who="phone", step="LDP-Feat: nearest words", operations=search, seconds=search / rates.search)
+    yield Cost(who="phone", step="LDP-Feat: draw sets", operations=float(n * m), seconds=n / rates.sets)
+    yield Cost(who="phone", step="affine: lift", seconds=n * rates.lifting)
+    yield Cost(who="sent", step="undefended, 8 bits a component", sent=n * (POSITION + d))
+    yield Cost(who="sent", step="LDP-Feat", sent=n * (POSITION + WORD * m))
+    yield Cost(who="sent", step="affine", sent=n * (POSITION + FLOAT * (dim + 1) * d))
+    yield Cost(who="server", step="match, undefended", operations=matching, seconds=matching / rates.search)
+    yield Cost(who="server", step="match, LDP-Feat: each candidate", operations=m * matching, seconds=m * matching / rates.search)
+    yield Cost(
+        who="server", step="match, affine", operations=(dim + 1) * matching, seconds=(dim + 1) * matching / rates.subspaces
+    )
+    yield Cost(who="attacker", step="affine: words near subspaces", operations=attack, seconds=attack / rates.subspaces)
+    yield Cost(who="attacker", step="paint, 256 x 256, eight times", seconds=rates.painting)
+
+
+def rows(service: Service, rates: Rates, queries: int) -> list[tuple[str, ...]]:
+    """Of each step: who, what, and operations, bytes and seconds of a query; then terabytes and cores of so many a day."""
+    return [
+        (
+            cost.who,
+            cost.step,
+            "" if cost.operations is None else f"{cost.operations:.2g}",
+            "" if cost.sent is None else f"{cost.sent:,}",
+            "" if cost.seconds is None else f"{cost.seconds:.2g}",
+            "" if cost.sent is None else f"{cost.sent * queries / 1e12:.3g}",
+            "" if cost.seconds is None else f"{cost.seconds * queries / DAY:.2g}",
+        )
+        for cost in query(service, rates)
+    ]

@@ -1,0 +1,53 @@
+"""The curve of repeated releases: how often the true word is told by T word sets, beside the bound that T ε sets."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from bench.mechanisms.multi_release import bound_on_success, chances_of_success
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+def rows(epsilon: float, domain: int, size: int, releases: int) -> list[dict[str, Any]]:
+    """One row for each T = 1, ..., `releases`, of the ω-subset mechanism on |K| = `domain` words with m = `size`.
+
+    `success` is the chance that the word that most sets hold is the true one, `bound` the greatest that any guess can have at
+    T ε, and `epsilon_total` is T ε.
+    """
+    chances = chances_of_success(epsilon, domain, size, releases)
+    return [
+        {
+            "releases": number,
+            "epsilon": epsilon,
+            "epsilon_total": number * epsilon,
+            "words": domain,
+            "subset_size": size,
+            "success": chance,
+            "bound": bound_on_success(number * epsilon, domain),
+        }
+        for number, chance in enumerate(chances, start=1)
+    ]
+
+
+def draw(curve: list[dict[str, Any]]) -> Figure:
+    """Success and bound over T, of one setting."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(5.2, 3.4), layout="constrained", dpi=120)
+    axes = figure.subplots()
+    setting = curve[0]
+    numbers = [row["releases"] for row in curve]
+    axes.plot(numbers, [row["bound"] for row in curve], "k--", label=r"bound at $T\varepsilon$")
+    axes.plot(numbers, [row["success"] for row in curve], "o-", color="tab:blue", label="the word that most sets hold")
+    axes.set_title(
+        rf"ldp, $\varepsilon$ = {setting['epsilon']:g}, m = {setting['subset_size']}, |K| = {setting['words']:,}", fontsize=9
+    )
+    axes.set_xlabel("releases of the same features, T")
+    axes.set_ylabel("chance that the true word is told")
+    axes.set_xticks(numbers)
+    axes.set_ylim(0, 1.04)
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.55, 0.93))
+    return figure
