@@ -13,7 +13,7 @@ import numpy as np
 
 from bench.api import DescriptorAttack, View
 from bench.core.errors import UserError
-from bench.core.metric_inputs import directions
+from bench.geometry.metric_inputs import directions
 from bench.mechanisms.multi_release import common_points, likeliest
 from bench.types import Floats, Indices, Knowledge, Release, Subspaces, WordSets
 

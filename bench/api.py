@@ -80,6 +80,11 @@ class Plugin:
         """The first line of the docstring."""
         return (cls.__doc__ or "").strip().partition("\n")[0]
 
+    @classmethod
+    def description(cls) -> str:
+        """The summary, and whatever else a reader of a list of plugins needs."""
+        return cls.summary()
+
 
 class Defense(Plugin, ABC):
     """Turns the secret features into what leaves the phone."""
@@ -265,6 +270,12 @@ class Metric(Plugin, ABC):
     higher_is_better_for: ClassVar[Literal["attacker", "defender"]]
     # What the formula leaves open, as records hold it.
     parameters: ClassVar[Mapping[str, Any]] = {}
+
+    @classmethod
+    def description(cls) -> str:
+        """The summary with the unit, the range, and for whom higher is better."""
+        low, high = cls.range
+        return f"{cls.summary()} ({cls.unit}, {low:g} to {high:g}, higher is better for the {cls.higher_is_better_for})"
 
     @abstractmethod
     def __call__(self, truth: Floats, estimate: Floats) -> float | None:

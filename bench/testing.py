@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 
 from bench.api import (
-    Asset,
     Attack,
     Dataset,
     Defense,
@@ -33,11 +32,11 @@ from bench.api import (
 )
 from bench.cache import feature_cache, store
 from bench.codebook import dictionary
+from bench.codebook.examples import example_features
 from bench.codebook.public import Public
 from bench.formats import tensor_file
 from bench.geometry.nearest_words import unit_rows
 from bench.images import photographs
-from bench.images.photographs import SIDE
 from bench.images.samples import Unit
 from bench.tasks.reconstruction import Reconstruction, view
 from bench.types import Descriptors, Features, Floats, Indices, Release, Subspaces, WordSets
@@ -48,27 +47,9 @@ TOLERANCE = 1e-5  # of norms and angles in float32
 NO_UNIT = Unit(name="made up", images=())
 
 
-def example_features(count: int = 50, seed: int = 0, length: int = 128) -> Features:
-    """Features as upright SIFT gives them, of no photograph."""
-    rng = np.random.default_rng(seed)
-    codes = np.minimum(rng.gamma(0.6, 40.0, (count, length)), 255).astype(np.uint8)
-    codes[:, 0] |= 1  # no row is zero
-    keypoints = rng.uniform(0, SIDE, (count, 2)).astype(np.float32)
-    return Features(keypoints=keypoints, descriptors=unit_rows(codes), codes=codes, size=(SIDE, SIDE))
-
-
 def shot(secret: Features, release: Release) -> Shot:
     """Features and their release, of a black photograph."""
     return Shot(pixels=lambda: np.zeros((*secret.size[::-1], 3), np.uint8), secret=secret, release=release)
-
-
-def small_dictionary(folder: Path, words: int = 512, seed: int = 1) -> Asset:
-    """Write a dictionary of made-up words and return it as a field's value."""
-    codes = example_features(words, seed).codes
-    assert codes is not None
-    path = folder / f"dictionary-{words}-{seed}.safetensors"
-    dictionary.save(path, codes, {"photographs": [], "extractor": {"name": "made-up"}})
-    return Asset(path)
 
 
 def check_defense(defense: Defense, public: Public, secret: Features) -> None:

@@ -15,8 +15,9 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from bench.core.errors import UserError
+from bench.core.hashing import canonical, short_hash
 from bench.runner import records as files
-from bench.runner.records import FILE, Record, canonical, short_hash
+from bench.runner.records import FILE, Record
 from leaderboard.intervals import Interval
 from leaderboard.measures import PRIVACY, Measure, measures, summary
 from leaderboard.tables import FIRST, extractor_label, labels, setting, units_of

@@ -14,7 +14,6 @@ from typing import Literal
 import numpy as np
 
 from bench.registry import discovery
-from bench.registry.listing import described
 from leaderboard.intervals import Interval, interval, proportion
 from leaderboard.tables import MEDIANS, PAPER
 
@@ -86,7 +85,7 @@ def _of_plugins() -> Iterator[Measure]:
     for plugin in discovery.everything(discovery.METRIC):
         name = plugin.name()
         better = -1 if plugin.higher_is_better_for == "attacker" else 1
-        yield Measure(name, name.upper() if name in PAPER else name, better, "mean", described(plugin))
+        yield Measure(name, name.upper() if name in PAPER else name, better, "mean", plugin.description())
 
 
 def _family(name: str) -> Measure:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
-from bench.runner.records import canonical
+from bench.core.hashing import canonical
 from leaderboard.comparison import Board
 from leaderboard.figures import drawable
 from leaderboard.intervals import Interval

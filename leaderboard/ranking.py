@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from bench.runner.records import canonical
+from bench.core.hashing import canonical
 from leaderboard.comparison import Board, Cell
 from leaderboard.intervals import Interval
 from leaderboard.measures import PRIVACY, Measure, measures

@@ -22,7 +22,8 @@ from typing import Any, Literal
 import numpy as np
 from scipy import stats
 
-from bench.runner.records import Record, canonical
+from bench.core.hashing import canonical
+from bench.runner.records import Record
 from leaderboard.intervals import interval
 from leaderboard.measures import measures
 from leaderboard.tables import labels

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
+from bench.core.hashing import canonical
 from bench.mechanisms.composition import DELTA, UNCOVERED
 from bench.registry import discovery
-from bench.registry.listing import described
-from bench.runner.records import Record, canonical, latest
+from bench.runner.records import Record, latest
 
 if TYPE_CHECKING:
     from rich.table import Table as RichTable
@@ -160,7 +160,7 @@ def _heading(name: str) -> str:
 def explanations(table: Table) -> list[str]:
     """What the numbers are, in lines."""
     known = {metric.name(): metric for metric in discovery.everything(discovery.METRIC)}
-    lines = [f"{name}: {described(known[name])}" for name in table.metrics if name in known]
+    lines = [f"{name}: {known[name].description()}" for name in table.metrics if name in known]
     return [*lines, COMPOSED, SEEDED]
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bench.runner.records import canonical
+from bench.core.hashing import canonical
 from leaderboard.comparison import Board, Cell
 from leaderboard.intervals import Interval
 from leaderboard.measures import PRIVACY, UTILITY, Measure, measures

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from bench.api import Metric
-from bench.core.metric_inputs import Doubles, image_pair
+from bench.geometry.metric_inputs import Doubles, image_pair
 from bench.types import Floats
 
 

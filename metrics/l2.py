@@ -8,7 +8,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from bench.api import Metric
-from bench.core.metric_inputs import descriptor_pair
+from bench.geometry.metric_inputs import descriptor_pair
 from bench.types import Floats
 
 

@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Literal
 
 from bench.api import Metric
 from bench.core.errors import UserError
-from bench.core.metric_inputs import Doubles, image_pair
+from bench.geometry.metric_inputs import Doubles, image_pair
 from bench.types import Floats
 
 

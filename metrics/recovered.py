@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 from bench.api import Metric
-from bench.core.metric_inputs import descriptor_pair, directions
+from bench.geometry.metric_inputs import descriptor_pair, directions
 from bench.types import Floats
 
 

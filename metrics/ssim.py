@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import Any, ClassVar, Literal
 
 from bench.api import LocalMetric
-from bench.core.metric_inputs import image_pair
+from bench.geometry.metric_inputs import image_pair
 from bench.types import Floats
 
 

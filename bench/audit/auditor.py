@@ -36,12 +36,12 @@ from bench.api import Defense
 from bench.audit.events import Answers, answers, common, watch
 from bench.audit.exhaustive import NotEnumerableError, greatest_ratio, law
 from bench.audit.findings import Finding, Tally
+from bench.codebook.examples import example_features, small_dictionary
 from bench.codebook.public import Public
 from bench.core.errors import UserError
 from bench.core.exact import exact
 from bench.geometry.nearest_words import unit_rows
 from bench.registry import fields
-from bench.testing import example_features, small_dictionary
 from bench.types import Features
 
 TIGHT = 0.9  # of the claimed ε, from which on a bound is called tight

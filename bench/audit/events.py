@@ -12,7 +12,7 @@ from functools import singledispatch
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.core.row_keys import row_keys
+from bench.geometry.row_keys import row_keys
 from bench.types import Descriptors, Floats, Release, Subspaces, WordSets
 
 Flags = NDArray[np.bool_]

@@ -18,9 +18,9 @@ from pathlib import Path
 from typing import Any
 
 from bench.core.errors import UserError
+from bench.core.hashing import canonical
 from bench.formats import tensor_file
 from bench.formats.tensor_file import Arrays
-from bench.runner.records import canonical
 
 VARIABLE = "FEATURE_PRIVACY_CACHE"  # of the environment: the folder
 SUFFIX = ".safetensors"

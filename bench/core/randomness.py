@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.runner.records import canonical
+from bench.core.hashing import canonical
 
 
 def randomness(*parts: Any) -> np.random.Generator:

@@ -51,7 +51,7 @@ def load(root: Path) -> Scene:
     models = [folder for folder in (root / "sparse", root / "sparse" / "0") if is_model(folder)]
     if not models:
         raise UserError(f"{root / 'sparse'}: no COLMAP model (cameras, images and points3D, .txt or .bin)")
-    listed: dict[Condition, Path] = {condition: queries_list(root, condition) for condition in get_args(Condition)}
+    listed: dict[Condition, Path] = {condition: lists.queries_path(root, condition) for condition in get_args(Condition)}
     present = {condition: path for condition, path in listed.items() if path.is_file()}
     if not present:
         raise UserError(f"{root / 'queries'}: no list of queries; expected {' or '.join(path.name for path in listed.values())}")
@@ -63,10 +63,6 @@ def load(root: Path) -> Scene:
         ground_truth=ground_truth(root),
         masks=root / "foreground",
     )
-
-
-def queries_list(root: Path, condition: Condition) -> Path:
-    return root / "queries" / f"{condition}_queries_with_intrinsics.txt"
 
 
 def ground_truth(root: Path) -> Path | None:

@@ -21,6 +21,11 @@ MODELS = sorted(set(pycolmap.CameraModelId.__members__) - {"INVALID"})
 T = TypeVar("T")
 
 
+def queries_path(root: Path, condition: str) -> Path:
+    """Return the path of the list of queries with intrinsics of one condition, in a folder of the layout `colmap`."""
+    return root / "queries" / f"{condition}_queries_with_intrinsics.txt"
+
+
 def read_intrinsics(path: Path) -> dict[str, tuple[int, pycolmap.Camera]]:
     """Name -> the line's number, and the camera.
 

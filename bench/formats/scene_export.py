@@ -15,7 +15,6 @@ from PIL import Image
 
 from bench.core.errors import UserError
 from bench.core.progress import Progress
-from bench.datasets import colmap
 from bench.formats import lists, nvm
 from bench.images.scene import Condition, Reference, Scene
 
@@ -65,7 +64,7 @@ def _as_colmap(scene: Scene, out: Path) -> Path:
     folder.mkdir(parents=True)
     model(scene.references).write_text(folder)
     for condition, cameras in _by_condition(scene).items():
-        lists.write_intrinsics(colmap.queries_list(out, condition), cameras)
+        lists.write_intrinsics(lists.queries_path(out, condition), cameras)
     return out / "images"
 
 

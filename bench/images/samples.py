@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bench.core.errors import UserError
+from bench.core.hashing import digest
 from bench.images import photographs
 from bench.images.photographs import Source
 from bench.images.scene import Mask, Pixels, Scene, SceneImage
-from bench.runner.records import canonical
 from bench.types import Bytes
 
 if TYPE_CHECKING:
@@ -100,11 +99,6 @@ def fingerprint(images: Sequence[SceneImage]) -> str:
         for image in images
     ]
     return digest(known)
-
-
-def digest(value: Any) -> str:
-    """SHA-256 of canonical JSON."""
-    return "sha256:" + hashlib.sha256(canonical(value).encode()).hexdigest()
 
 
 def read(image: ImageSource) -> tuple[Bytes, tuple[str, ...]]:

@@ -19,8 +19,8 @@ from bench.codebook.dictionary import Dictionary
 from bench.codebook.public import Public
 from bench.core.errors import UnitError, UserError
 from bench.core.progress import Progress
-from bench.core.row_keys import row_keys
 from bench.geometry.nearest_words import unit_rows
+from bench.geometry.row_keys import row_keys
 from bench.images.photographs import SIDE
 from bench.images.views import PhotographView
 from bench.inversion.encoding import condition

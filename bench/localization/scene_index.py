@@ -11,6 +11,7 @@ from bench.api import Extractor
 from bench.cache import feature_cache, provenance, store
 from bench.codebook import build, dictionary
 from bench.codebook.dictionary import Dictionary
+from bench.core import hashing
 from bench.core.errors import UserError
 from bench.images import samples
 from bench.images.scene import Scene, SceneImage
@@ -38,7 +39,7 @@ class Place:
     def digest(self) -> str:
         """Of what the dictionary is made from and how, but for the number of its words."""
         hashes = [image.pixels.content_hash() for image in self.scene.references]
-        return samples.digest(["references", hashes, spec.written(self.extractor), SEED, provenance.source(build.__name__)])
+        return hashing.digest(["references", hashes, spec.written(self.extractor), SEED, provenance.source(build.__name__)])
 
     def features(self, image: SceneImage) -> Features:
         """Of a reference or a query."""

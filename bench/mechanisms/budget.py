@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from bench.core.errors import UserError
 from bench.mechanisms.composition import DELTA, UNCOVERED, basic, epsilon_left, optimal
 from bench.mechanisms.subset import information, log10_chance, most_accurate_size, most_informative_size
-from bench.runner.records import Record
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -78,7 +77,7 @@ def yields(plan: Budget) -> list[Yield]:
     return found
 
 
-def nearest(records: Sequence[Record], epsilon: float) -> list[Record]:
+def nearest(records: Sequence[Mapping[str, Any]], epsilon: float) -> list[Mapping[str, Any]]:
     """Those of the records whose ε of a descriptor is nearest.
 
     Raises

@@ -14,8 +14,8 @@ from randomgen import ChaCha
 from bench.api import Defense
 from bench.codebook.public import Public
 from bench.core.errors import UserError
+from bench.core.hashing import canonical
 from bench.registry import spec
-from bench.runner.records import canonical
 from bench.types import Features, Release
 
 KEY = 32  # bytes

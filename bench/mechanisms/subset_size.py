@@ -19,9 +19,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +29,6 @@ from scipy import stats
 
 from bench.core.errors import UserError
 from bench.mechanisms.subset import information, log10_chance, most_accurate_size, most_informative_size
-from bench.runner.records import Record
 from bench.types import Indices
 
 if TYPE_CHECKING:
@@ -117,7 +116,7 @@ def kept(right: Indices, wrong: float, trials: int, agreeing: float) -> Doubles:
 
 
 def measured(
-    records: Sequence[Record], epsilon: float, domain: int, trials: int, condition: str
+    records: Sequence[Mapping[str, Any]], epsilon: float, domain: int, trials: int, condition: str
 ) -> tuple[dict[int, list[float]], list[float]]:
     """What was measured by localization with `ldp`: of each size whether each query was localized; and n / N of each query.
 
@@ -144,7 +143,7 @@ def measured(
     return found, repeated
 
 
-def _is_told(record: Record, trials: int, condition: str) -> bool:
+def _is_told(record: Mapping[str, Any], trials: int, condition: str) -> bool:
     """Whether it is of a query under that condition, with what serves the release best, and so many trials."""
     settings = record.get("task_settings") or {}
     return (

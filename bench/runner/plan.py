@@ -14,10 +14,9 @@ from typing import Any
 from bench.api import Attack, CarryOut, Dataset, Defense, Extractor, Metric, Plugin, Privacy, Task, at_once
 from bench.cache import feature_cache
 from bench.codebook.public import Public
-from bench.core import environment
+from bench.core import environment, hashing
 from bench.core.errors import UserError
 from bench.extractors.sift import Sift
-from bench.images import samples
 from bench.images.samples import Images, Unit
 from bench.localization.scene_index import Place
 from bench.registry import discovery, fields, spec
@@ -73,7 +72,7 @@ class Plan:
     @property
     def hash(self) -> str:
         """Of configuration and inputs."""
-        return records.short_hash(sorted(cell.head["cell_id"] for cell in self.cells))
+        return hashing.short_hash(sorted(cell.head["cell_id"] for cell in self.cells))
 
     @property
     def needs_map(self) -> bool:
@@ -229,7 +228,7 @@ def planned(asked: Asked, describe: Describe = environment.describe) -> Plan:
     judged = {
         "name": collection.name,
         "spec": None if dataset is None else spec.written(dataset),
-        "hash": samples.digest(hashes | dict(collection.beside)),
+        "hash": hashing.digest(hashes | dict(collection.beside)),
         "extractor": spec.configuration(extractor, public),
     }
     metrics = (*_metrics(), *asked.metrics) if task.attacked else ()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import fcntl
-import hashlib
 import json
 import logging
 import math
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bench.core.errors import UserError
+from bench.core.hashing import short_hash
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -25,16 +25,6 @@ Record = dict[str, Any]
 SCHEMA = 1
 FILE = "records.jsonl"
 EVERY_UNIT = "*"  # the unit of a record that holds for the whole cell, such as one that does not apply
-
-
-def canonical(value: Any) -> str:
-    """JSON in one way of writing, for hashing."""
-    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
-
-
-def short_hash(value: Any) -> str:
-    """The first 64 bits of the SHA-256 of the canonical JSON, in hexadecimal."""
-    return hashlib.sha256(canonical(value).encode()).hexdigest()[:16]
 
 
 def cell_id(task: Any, defense: Any, attack: Any, dataset: dict[str, Any], seed: int, metric_settings: Any) -> str:

@@ -4,18 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from bench.runner import directory, records
 from bench.runner.records import EVERY_UNIT, Record
-
-if TYPE_CHECKING:
-    from rich.table import Table
-    from rich.text import Text
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,45 +78,6 @@ def status(out: Path) -> Status:
             cells[cell["run_hash"]] = CellStatus(head=cell, count=count, reason=cell["reason"])
     planned = {(cell["run_hash"], unit) for plan in plans for cell in plan["cells"] for unit in (*plan["units"], EVERY_UNIT)}
     return Status(cells=tuple(cells.values()), other=len(found.keys() - planned), writer=writer, alive=alive)
-
-
-def shown(out: Path) -> Iterator[Table | Text]:
-    """The status of a folder for a terminal.
-
-    Raises
-    ------
-    UserError
-        as `status`.
-    """
-    from rich.table import Table
-    from rich.text import Text
-
-    from leaderboard.tables import labels
-
-    found = status(out)
-    names = labels([(cell.head["defense"], cell.head["attack"]) for cell in found.cells])
-    yield Text(f"{out}: {told(found)}")
-    table = Table()
-    for column in ("task", "defense", "attack", "seed", "done", "running", "failed", "missing", "n/a"):
-        table.add_column(column, overflow="fold", justify="left" if column in ("task", "defense", "attack", "n/a") else "right")
-    for cell, (defense, attack) in zip(found.cells, names, strict=True):
-        counts = ["n/a"] * 4 if cell.reason else list(map(str, dataclasses.astuple(cell.count)))
-        row = (cell.head["task"], defense, attack, str(cell.head["seed"]), *counts, cell.reason or "")
-        table.add_row(*map(Text, row))
-    yield table
-
-
-def overview(folder: Path) -> Table:
-    """The status of every run in a folder, one a line."""
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(title=Text(str(folder)), title_justify="left")
-    for column in ("run", "status"):
-        table.add_column(column, overflow="fold")
-    for plan in sorted(folder.glob(f"*/{directory.PLAN}")):
-        table.add_row(Text(plan.parent.name), Text(told(status(plan.parent))))
-    return table
 
 
 def told(found: Status) -> str:

@@ -20,6 +20,7 @@ from PIL import Image
 
 from bench.api import Attack, Defense, Outcome, Shot, Trial, at_once
 from bench.cache import feature_cache
+from bench.core import hashing
 from bench.core.errors import PluginError, UnitError, UserError, blamed
 from bench.core.randomness import randomness
 from bench.images import samples
@@ -59,7 +60,7 @@ class Trials:
 
     def __init__(self, plan: Plan) -> None:
         self.plan = plan
-        self._order = samples.digest(list(plan.hashes))  # in which the releases of others come
+        self._order = hashing.digest(list(plan.hashes))  # in which the releases of others come
         self._observed = functools.lru_cache(maxsize=1)(self._observe)
         self._shots = functools.lru_cache(maxsize=1)(self._release)
         self._population = functools.lru_cache(maxsize=None)(self._others)

@@ -24,8 +24,8 @@ from scipy.spatial import cKDTree
 
 from bench.api import Attack, Dataset, Defense, Extractor, Outcome, Task, Trial
 from bench.codebook.public import Public
+from bench.core import hashing
 from bench.core.errors import UnitError, UserError
-from bench.images import samples
 from bench.images.samples import Collection, Images, Unit
 from bench.localization import two_view_matching
 from bench.rendering import homographies
@@ -127,7 +127,7 @@ def _collected(name: str, pairs: Sequence[Pair]) -> Collection:
     return Collection(
         name=name,
         units=tuple(Unit(name=pair.name, images=(pair.first, pair.second), subject=pair) for pair in pairs),
-        beside={"homographies": samples.digest(homographies_of)},
+        beside={"homographies": hashing.digest(homographies_of)},
     )
 
 

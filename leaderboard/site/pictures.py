@@ -10,8 +10,9 @@ from pathlib import Path
 
 from PIL import Image
 
+from bench.core import hashing
 from bench.core.errors import UnitError
-from bench.images import photographs, samples
+from bench.images import photographs
 from bench.images.photographs import Source
 from bench.runner import directory
 from bench.runner.records import Record
@@ -74,4 +75,4 @@ def _written(content: bytes, read: Callable[[], Image.Image], out: Path) -> str 
 def _all_builtin() -> tuple[dict[str, Source], str]:
     """By name, and the hash that records know them by."""
     sources = {source.name: source for source in photographs.builtin()}
-    return sources, samples.digest({name: source.content_hash() for name, source in sources.items()})
+    return sources, hashing.digest({name: source.content_hash() for name, source in sources.items()})

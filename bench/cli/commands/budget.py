@@ -31,7 +31,7 @@ def execute(args: argparse.Namespace) -> int:
     plan = budget.budget(args.image_epsilon, args.keypoints, args.releases, words)
     print_rich(*budget.report(plan))
     if args.results is not None:
-        measured = budget.nearest(records.read(records.find(args.results)).records, plan.epsilon)
+        measured = [dict(record) for record in budget.nearest(records.read(records.find(args.results)).records, plan.epsilon)]
         print(f"The nearest that was measured: ε = {float(measured[0]['privacy']['epsilon_descriptor']):g} for a descriptor")
         print_rich(*(tables.to_rich(table) for table in tables.tables(measured)))
     return DONE

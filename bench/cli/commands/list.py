@@ -16,7 +16,7 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(args: argparse.Namespace) -> int:
-    from bench.registry.listing import SECTIONS, listing
+    from bench.cli.listing import SECTIONS, listing
 
     if args.what is not None and args.what not in SECTIONS:
         raise unknown("list", args.what, SECTIONS)

@@ -23,14 +23,15 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(args: argparse.Namespace) -> int:
-    from bench.runner import status, suite
+    from bench.cli.status import overview_table, status_table
+    from bench.runner import suite
 
     if args.suite is not None and args.results is not None:
         raise UserError("give a suite or --results, not both")
     if args.suite is not None:
-        print_rich(*status.shown(suite.folder(args.suite)))
+        print_rich(*status_table(suite.folder(args.suite)))
     elif args.results is not None:
-        print_rich(*status.shown(args.results))
+        print_rich(*status_table(args.results))
     else:
-        print_rich(status.overview(Path("runs")))
+        print_rich(overview_table(Path("runs")))
     return DONE

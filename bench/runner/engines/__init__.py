@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from bench.core import environment
 from bench.core.errors import UserError, unknown
-from bench.runner.records import short_hash
+from bench.core.hashing import short_hash
 from bench.runner.trial import Made, Trials
 
 if TYPE_CHECKING:

@@ -1,0 +1,173 @@
+"""Plateau against enumeration and theory; with a plateau of one word it is `ldp`."""
+
+import dataclasses
+import math
+from collections import Counter
+from fractions import Fraction
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from bench.audit.auditor import audit, near_words
+from bench.audit.exhaustive import law
+from bench.codebook.examples import example_features, small_dictionary
+from bench.codebook.public import Public
+from bench.core.errors import UserError
+from bench.core.exact import Exact
+from bench.geometry.nearest_words import unit_rows
+from bench.mechanisms.subset import chance_digits, word_subsets
+from bench.types import Features, WordSets
+from defenses.ldp import LDP
+from defenses.plateau import Plateau, plateau_subsets
+
+ALPHA, CERTAINLY_WRONG = 1e-4, 1e-9
+
+
+def theorem(plateau: set[int], domain: int, epsilon: float, size: int) -> dict[tuple[int, ...], float]:
+    """Pr(Z | v) for all sets Z, by counting those that meet the plateau."""
+    sets = list(combinations(range(domain), size))
+    weights = [math.exp(epsilon) if plateau & set(Z) else 1.0 for Z in sets]
+    return {Z: weight / sum(weights) for Z, weight in zip(sets, weights, strict=True)}
+
+
+CASES = [(7, 1, 1, 1.0), (7, 2, 2, 1.5), (6, 3, 2, 0.5), (8, 2, 4, 2.0), (5, 4, 3, 1.0), (6, 2, 5, 1.0), (7, 1, 3, 0.0)]
+
+
+@pytest.mark.parametrize(("domain", "size", "near", "epsilon"), CASES)
+def test_sets_against_the_theorem(domain: int, size: int, near: int, epsilon: float) -> None:
+    draws = 100_000
+    plateau = np.sort(np.random.default_rng(near).permutation(domain)[:near])
+    drawn = plateau_subsets(np.tile(plateau, (draws, 1)), domain, epsilon, size, np.random.default_rng(0))
+    assert (np.diff(drawn, axis=1) > 0).all()
+    seen = Counter(map(tuple, drawn.tolist()))
+    expected = theorem(set(plateau.tolist()), domain, epsilon, size)
+    assert stats.chisquare([seen[Z] for Z in expected], [draws * chance for chance in expected.values()]).pvalue > ALPHA
+    if epsilon and near + size <= domain:
+        control = theorem(set(plateau.tolist()), domain, epsilon + 0.4, size)
+        assert stats.chisquare([seen[Z] for Z in expected], [draws * chance for chance in control.values()]).pvalue < 1e-6
+
+
+def test_the_sampler_has_the_law_of_the_theorem() -> None:
+    """To within 2^-58, as the digits of p are: by playing all courses of its draws."""
+    domain, size, epsilon = 5, 2, 1.0
+    meeting, every = math.comb(5, 2) - math.comb(3, 2), math.comb(5, 2)
+    p = Fraction(chance_digits(epsilon, every, meeting, 128), 2**128)
+    found = law(lambda rng: tuple(plateau_subsets(np.array([[1, 3]]), domain, epsilon, size, rng)[0].tolist()))
+    for Z in combinations(range(domain), size):
+        expected = p / meeting if {1, 3} & set(Z) else (1 - p) / (every - meeting)
+        assert found.chances[Z] <= expected + Fraction(1, 2**120)
+        assert expected <= found.at_most(Z) + Fraction(1, 2**120)
+
+
+def test_a_plateau_of_one_is_ldp() -> None:
+    for size in (1, 2):
+        laws = [
+            law(lambda rng: tuple(plateau_subsets(np.array([[2]]), 4, 1.5, size, rng)[0].tolist())),  # noqa: B023
+            law(lambda rng: tuple(word_subsets(np.array([2]), 4, 1.5, size, rng)[0].tolist())),  # noqa: B023
+        ]
+        assert laws[0].chances.keys() == laws[1].chances.keys()
+        for Z, chance in laws[0].chances.items():
+            assert abs(chance - laws[1].chances[Z]) < Fraction(1, 2**56)
+
+
+def test_near_words_are_told_nearly_as_often_as_the_true_one(tmp_path: Path) -> None:
+    public, asset = Public(), small_dictionary(tmp_path, 400)
+    known = public.dictionary(asset)
+    secrets = near_words(LDP(dictionary=asset), public).take(np.full(4000, 17))
+    T = known.neighbours.nearest(np.array([17]), 4)[0]
+    release = Plateau(epsilon=4.0, near=4, dictionary=asset).protect(secrets, public, np.random.default_rng(0))
+    rates = np.array([(release.words == word).any(axis=1).mean() for word in T])
+    promised = 10 ** (Plateau(epsilon=4.0, near=4, dictionary=asset).privacy(public).log10_true or 0)
+    np.testing.assert_allclose(rates, promised, atol=0.03)
+    ldp = 10 ** (LDP(epsilon=4.0, dictionary=asset).privacy(public).log10_true or 0)
+    assert promised < ldp < rates.sum()
+    np.testing.assert_allclose(release.candidates, unit_rows(known.words[release.words]))
+
+
+def test_the_chance_of_the_true_word_against_the_theorem(tmp_path: Path) -> None:
+    for domain, size, near, epsilon in ((12, 3, 4, 1.5), (9, 1, 2, 0.5), (6, 4, 3, 2.0)):
+        defense = Plateau(epsilon=epsilon, subset_size=size, near=near, dictionary=small_dictionary(tmp_path, domain))
+        expected = sum(chance for Z, chance in theorem(set(range(near)), domain, epsilon, size).items() if 0 in Z)
+        assert 10 ** (defense.privacy(Public()).log10_true or 0) == pytest.approx(expected, rel=1e-9)
+    assert Plateau(epsilon=math.inf, dictionary=small_dictionary(tmp_path)).privacy(Public()).guarantee == "none"
+
+
+# ---- the audit
+
+
+@pytest.mark.parametrize(
+    ("defense", "words"),
+    [(Plateau(epsilon=2.0), 64), (Plateau(epsilon=Exact("1/3"), subset_size=1, near=2), 4), (Plateau(epsilon=100.0), 64)],
+)
+def test_it_keeps_its_promise(defense: Plateau, words: int, tmp_path: Path) -> None:
+    found = audit(defense, words, 10_000, 0, tmp_path)
+    assert found.verdict != "violated"
+    if defense.epsilon == 2.0:
+        assert found.strongest.epsilon > 1.3
+    if words == 4:
+        assert found.enumeration is not None
+        assert found.enumeration.low == pytest.approx(1 / 3, abs=1e-14) == found.enumeration.high
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class OneWordForAll(Plateau):
+    """Tells as often as a plateau of `near` words may, and always the true word."""
+
+    def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> WordSets:
+        known = public.dictionary(self.dictionary)
+        release = super().protect(secret, public, rng)
+        true, words = public.nearest_words(self.dictionary, secret), release.words
+        assert words is not None
+        met = (known.neighbours.nearest(true, self.near)[:, :, None] == words[:, None]).any(axis=(1, 2))
+        words[met & ~(words == true[:, None]).any(axis=1), 0] = true[met & ~(words == true[:, None]).any(axis=1)]
+        words = np.sort(words, axis=1)
+        return dataclasses.replace(release, words=words, candidates=unit_rows(known.words[words]))
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class AsManyAsAreAlike(Plateau):
+    """A plateau of more words for one half of the dictionary, so that normalisers differ."""
+
+    def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> WordSets:
+        known = public.dictionary(self.dictionary)
+        words = np.empty((len(secret), self.subset_size), dtype=np.int64)
+        for row, true in enumerate(public.nearest_words(self.dictionary, secret)):
+            plateau = known.neighbours.nearest(np.array([true]), self.near + 1 if true < len(known) // 2 else 1)
+            words[row] = plateau_subsets(plateau, len(known), self.epsilon, self.subset_size, rng)[0]
+        return WordSets(
+            keypoints=secret.keypoints.copy(), size=secret.size, candidates=unit_rows(known.words[words]), words=words
+        )
+
+
+def test_broken_ones_are_caught(tmp_path: Path) -> None:
+    found = audit(OneWordForAll(epsilon=2.0), 64, 20_000, 0, tmp_path)
+    assert {finding.family for finding in found.findings if finding.certain > 2.0} >= {"membership"}
+    found = audit(AsManyAsAreAlike(epsilon=0.5, subset_size=1, near=2), 4, 400, 0, tmp_path)
+    assert found.enumeration is not None
+    assert found.enumeration.exceeds
+
+
+# ---- what is asked
+
+
+@pytest.mark.parametrize(
+    ("given", "complaint"),
+    [
+        ({"epsilon": -1.0}, "epsilon must be at least 0"),
+        ({"near": 0}, "near must be at least 1"),
+        ({"subset_size": 0}, "subset_size and near must be at least 1"),
+        ({"words": 1}, "words must be 0 for all"),
+    ],
+)
+def test_mistakes(given: dict[str, float], complaint: str) -> None:
+    with pytest.raises(UserError, match=complaint):
+        Plateau(**given)  # type: ignore[arg-type]
+
+
+def test_a_dictionary_may_be_too_small(tmp_path: Path) -> None:
+    defense = Plateau(near=9, dictionary=small_dictionary(tmp_path, 8))
+    with pytest.raises(UserError, match="near 9, but the dictionary has 8 words"):
+        defense.protect(example_features(3), Public(), np.random.default_rng(0))

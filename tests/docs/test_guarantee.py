@@ -1,0 +1,90 @@
+"""What docs/guarantee.md shows works as it stands there, and the numbers that it states are right."""
+
+import math
+import re
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import bench
+from bench import cli
+from bench.audit.bounds import log_ratio
+from bench.codebook.dictionary import Dictionary
+from bench.codebook.examples import example_features
+from bench.codebook.public import Public
+from bench.mechanisms.composition import epsilon_left
+from bench.mechanisms.subset import information, log10_chance, most_accurate_size, most_informative_size
+from defenses.ldp import LDP
+
+PAGE = (Path(__file__).resolve().parents[2] / "docs" / "guarantee.md").read_text(encoding="utf-8")
+COMMANDS = re.findall(r"^bench (.+)$", PAGE, re.MULTILINE)
+MILLION = "audit --defense ldp:epsilon=2,subset_size=2 --words 64 --trials 1000000"
+
+
+def test_all_commands_are_found() -> None:
+    assert MILLION in COMMANDS
+    assert len(COMMANDS) == PAGE.count("```\nbench ") == 6
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_commands_run(command: str, capfd: pytest.CaptureFixture[str]) -> None:
+    """The audit of a million trials takes some seconds, and finds ε between 1.94 and 2."""
+    assert cli.main(shlex.split(command)) == 0
+    shown = capfd.readouterr().out
+    if command == MILLION:
+        bound = float(re.search(r"ε is at least ([0-9.]+) with confidence 95%", shown)[1])  # type: ignore[index]
+        assert 1.94 <= bound <= 2.00
+        assert "tight" in shown
+
+
+def test_the_line_of_python_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (line,) = re.findall(r"```python\n(.*?)\n```", PAGE, re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    found: dict[str, object] = {"bench": bench, "LDP": LDP, "features": example_features(20)}
+    exec(line, found)
+    assert len(found["release"]) == 20  # type: ignore[arg-type]
+    assert (tmp_path / "device.key").is_file()
+
+
+def test_numbers() -> None:
+    shipped: Dictionary = Public().dictionary("shipped")
+    words = len(shipped)
+    assert words == 256_000
+    assert f"{math.exp(10):,.0f} times" in PAGE
+    left = epsilon_left(10.0, 1000)
+    assert f"About {left:.3f}: then" in PAGE
+    one_in = 2 / 10 ** log10_chance(left, words, 2)
+    assert f"one released word in {round(one_in, -3):,.0f} is the true one" in PAGE
+    assert f"**{most_informative_size(10.0, words)}** of 256,000 words" in PAGE
+    assert f"**{most_accurate_size(10.0, words)}** at the same point" in PAGE
+
+
+def test_what_sets_of_each_size_tell() -> None:
+    """Of the table of sizes: what does not rest on measurements."""
+    rows = re.findall(r"^\| (\d+)[^|]*\| ([\d.]+) \| ([\d.]+) \|", PAGE, re.MULTILINE)
+    assert [int(size) for size, _, _ in rows] == [
+        1,
+        2,
+        4,
+        8,
+        most_accurate_size(6.534, 8000),
+        16,
+        most_informative_size(6.534, 8000),
+    ]
+    for size, told, bits in rows:
+        assert f"{10 ** log10_chance(6.534, 8000, int(size)):.3f}" == told
+        assert f"{information(6.534, 8000, np.array([int(size)]))[0] / math.log(2):.2f}" == bits
+
+
+def test_how_much_trials_can_show() -> None:
+    """Of a defense that always tells its word and never another; half of the trials are measured."""
+
+    def most(trials: int) -> float:
+        return float(log_ratio(trials // 2, trials // 2, 0, trials // 2, 0.95))
+
+    for trials in (10**4, 10**6, 10**8):
+        assert most(trials) == pytest.approx(math.log(trials) - 2, abs=0.01)
+    assert most(160_000) == pytest.approx(10, abs=0.02)
+    assert f"a million can show {most(10**6):.1f}" in PAGE

@@ -1,0 +1,289 @@
+"""To and from other programs: hloc, COLMAP, kornia, TensorBoard; and how MegaDepth and HPatches lie on disk."""
+
+import builtins
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pycolmap
+import pytest
+import torch
+from fakes import album, texture
+from PIL import Image
+
+from bench import cli
+from bench.codebook.examples import small_dictionary
+from bench.core.errors import UnitError, UserError
+from bench.extractors.colmap_database import ColmapDatabase
+from bench.extractors.hardnet import WEIGHTS, HardNet
+from bench.extractors.hloc import Hloc
+from bench.extractors.sift import Sift
+from bench.formats.stored_features import in_square, out_of_square
+from bench.images import photographs
+from bench.runner import feature_export
+from bench.testing import check_extractor
+
+kornia = pytest.importorskip("kornia")
+
+
+@pytest.fixture
+def images(tmp_path: Path) -> Path:
+    """Photographs that are no squares, in folders."""
+    root = tmp_path / "photos"
+    for number, name in enumerate(("street/a.png", "b.png")):
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        texture(number, (300 + number, 200)).save(root / name)
+    return root
+
+
+def export(*arguments: object) -> int:
+    return cli.main(["export", *map(str, arguments)])
+
+
+# ---- where points lie
+
+
+def test_into_the_square_and_out_again(rng: np.random.Generator) -> None:
+    points = rng.uniform(0, 300, (20, 2))
+    for size in ((300, 200), (201, 300), (64, 64)):
+        np.testing.assert_allclose(out_of_square(in_square(points, size, 256), size, 256), points)
+
+
+# ---- hloc
+
+
+def test_features_for_hloc_are_those_that_come_back(images: Path, tmp_path: Path) -> None:
+    out, pairs = tmp_path / "features.h5", tmp_path / "pairs.txt"
+    assert export("--images", images, "--layout", "hloc", "--out", out, "--pairs", pairs) == 0
+    path = images / "street" / "a.png"
+    pixels = photographs.read(path).pixels
+    ours, back = Sift().extract(pixels), Hloc(path=out).extract(pixels, path)
+    np.testing.assert_allclose(back.keypoints, ours.keypoints, atol=1e-3)
+    np.testing.assert_allclose(back.descriptors, ours.descriptors, atol=1e-6)
+    with h5py.File(out) as opened:
+        group = opened["street/a.png"]
+        assert group["descriptors"].shape == (128, len(ours))
+        assert group["image_size"][()].tolist() == [300, 200]
+        xy = group["keypoints"][()]  # of the photograph, the centre of the first pixel at (0, 0)
+    np.testing.assert_allclose(xy, ours.keypoints * (200 / 256) + [50, 0] - 0.5, atol=1e-3)
+    assert feature_export.read_pairs(pairs) == [("b.png", "street/a.png")]
+
+
+def test_of_a_set_each_word_is_written_and_of_a_subspace_what_is_recovered(
+    images: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    ldp = f"ldp:epsilon=inf,subset_size=3,dictionary={small_dictionary(tmp_path)}"
+    out = tmp_path / "sets.h5"
+    assert export("--images", images, "--defense", ldp, "--layout", "hloc", "--out", out) == 0
+    count = len(Sift().extract(photographs.read(images / "b.png").pixels))
+    with h5py.File(out) as opened:
+        xy = opened["b.png"]["keypoints"][()]
+    assert len(xy) == 3 * count
+    assert np.array_equal(xy[0::3], xy[1::3])
+    affine = f"affine:dim=2,sub_databases=1,database={small_dictionary(tmp_path)}"
+    assert export("--images", images, "--defense", affine, "--layout", "hloc", "--out", tmp_path / "x.h5") == 2
+    assert "a release of Subspaces has no descriptors; --attack exports what is recovered" in capfd.readouterr().err
+    nearest = f"nearest:database={small_dictionary(tmp_path, seed=2)}"
+    recovered = tmp_path / "recovered.h5"
+    assert export("--images", images, "--defense", affine, "--attack", nearest, "--layout", "hloc", "--out", recovered) == 0
+    with h5py.File(recovered) as opened:
+        rows = opened["b.png"]["descriptors"][()].T
+    assert rows.shape == (count, 128)
+    np.testing.assert_allclose(np.linalg.norm(rows, axis=1), 1, atol=1e-5)
+
+
+def test_mistakes_of_export(images: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    for arguments, complaint in (
+        (("--layout", "hlco", "--out", tmp_path / "x"), "--layout hlco: there is hloc and colmap"),
+        (("--layout", "hloc", "--out", images / "b.png"), "exists already"),
+        (("--layout", "hloc", "--out", tmp_path / "x", "--attack", "nearest"), "nearest attacks Subspaces"),
+    ):
+        assert export("--images", images, *arguments) == 2
+        assert complaint in capfd.readouterr().err
+    assert not (tmp_path / "x").exists()
+
+
+def test_lists_of_pairs(tmp_path: Path) -> None:
+    (tmp_path / "pairs.txt").write_text("a.png b.png\n\nc.png\n")
+    with pytest.raises(UserError, match=r"pairs.txt:3: a pair has two names, but there are 1"):
+        feature_export.read_pairs(tmp_path / "pairs.txt")
+    with pytest.raises(UserError, match="space"):
+        feature_export.write_pairs(tmp_path / "new.txt", ["a b.png", "c.png"])
+
+
+# ---- COLMAP
+
+
+def test_database_for_colmap_is_read_by_colmap_and_by_us(images: Path, tmp_path: Path) -> None:
+    out = tmp_path / "database.db"
+    assert export("--images", images, "--layout", "colmap", "--out", out) == 0
+    path = images / "street" / "a.png"
+    pixels = photographs.read(path).pixels
+    ours = Sift().extract(pixels)
+    with pycolmap.Database.open(out) as database:
+        image = database.read_image_with_name("street/a.png")
+        camera = database.read_camera(image.camera_id)
+        xy = database.read_keypoints(image.image_id)
+        assert database.num_frames() == database.num_images() == 2  # as its incremental mapper wants them
+    assert (camera.width, camera.height) == (300, 200)
+    np.testing.assert_allclose(xy[:, :2], ours.keypoints * (200 / 256) + [50, 0], atol=1e-3)
+    back = ColmapDatabase(path=out).extract(pixels, path)
+    np.testing.assert_allclose(back.keypoints, ours.keypoints, atol=1e-3)
+    assert back.codes is not None
+    assert ours.codes is not None
+    np.testing.assert_allclose(back.codes.astype(int), ours.codes.astype(int), atol=2)  # SIFT's norm is 512 but for rounding
+    check_extractor(ColmapDatabase(path=out), pixels, path)
+
+
+def test_what_colmap_extracted_is_read(tmp_path: Path) -> None:
+    """An independent writer: COLMAP's own SIFT."""
+    root = album(tmp_path / "photos", 1)
+    texture(5, (256, 256)).save(root / "0.png")
+    out = tmp_path / "database.db"
+    pycolmap.extract_features(out, root, device=pycolmap.Device.cpu)
+    path = root / "0.png"
+    found = ColmapDatabase(path=out).extract(photographs.read(path).pixels, path)
+    with pycolmap.Database.open(out) as database:
+        image = database.read_image_with_name("0.png")
+        assert len(found) == database.num_keypoints_for_image(image.image_id)
+        xy = database.read_keypoints(image.image_id)[:, :2]
+    np.testing.assert_allclose(found.keypoints, xy[np.lexsort((xy[:, 0], xy[:, 1]))], atol=1e-4)
+
+
+def test_databases_that_cannot_serve(images: Path, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="no such file"):
+        ColmapDatabase(path=tmp_path / "absent.db")
+    with pytest.raises(UserError, match="not a COLMAP database"):
+        ColmapDatabase(path=images / "b.png")
+    out = tmp_path / "database.db"
+    assert export("--images", images, "--layout", "colmap", "--out", out) == 0
+    stranger = tmp_path / "stranger.png"
+    texture(9, (300, 200)).save(stranger)
+    with pytest.raises(UnitError, match="no image of that name"):
+        ColmapDatabase(path=out).extract(photographs.read(stranger).pixels, stranger)
+    texture(9, (100, 200)).save(images / "b.png")
+    with pytest.raises(UnitError, match="the photograph has"):
+        ColmapDatabase(path=out).extract(photographs.read(images / "b.png").pixels, images / "b.png")
+    with pytest.raises(UserError, match="this one has none"):
+        ColmapDatabase(path=out).extract(np.zeros((256, 256, 3), np.uint8))
+
+
+# ---- layouts of photographs
+
+
+def test_of_megadepth_the_photographs_are_taken(tmp_path: Path) -> None:
+    scene = tmp_path / "phoenix" / "S6" / "zl548" / "MegaDepth_v1" / "0000"
+    for name in ("dense0/imgs/a.jpg", "dense1/imgs/b.jpg", "dense0/depths/a.png"):
+        (scene / name).parent.mkdir(parents=True, exist_ok=True)
+        texture(0).save(scene / name)
+    found = photographs.folder(tmp_path / "phoenix")
+    assert [source.path.name for source in found] == ["a.jpg", "b.jpg"]
+    assert found[0].name == "S6/zl548/MegaDepth_v1/0000/dense0/imgs/a.jpg"
+
+
+def test_of_hpatches_every_image_is_taken(tmp_path: Path) -> None:
+    for sequence in ("i_dome", "v_wall"):
+        (tmp_path / sequence).mkdir()
+        for number in range(1, 7):
+            texture(number).save(tmp_path / sequence / f"{number}.ppm")
+        (tmp_path / sequence / "H_1_2").write_text("1 0 0\n0 1 0\n0 0 1\n")
+    found = photographs.folder(tmp_path)
+    assert len(found) == 12
+    assert photographs.read(found[0].path).pixels.shape == (256, 256, 3)
+
+
+# ---- HardNet
+
+
+@pytest.fixture
+def weights(tmp_path: Path) -> Path:
+    """A file as kornia keeps it, of random weights."""
+    torch.manual_seed(0)
+    path = tmp_path / "hub" / "checkpoints" / f"hardnet--{WEIGHTS}"
+    path.parent.mkdir(parents=True)
+    torch.save({"state_dict": kornia.feature.HardNet(pretrained=False).state_dict()}, path)
+    return path
+
+
+def test_hardnet_keeps_the_contract_and_describes_as_kornia_does(weights: Path) -> None:
+    image = np.asarray(texture(0, (256, 256)))
+    extractor = HardNet(weights=weights, max_keypoints=20)
+    check_extractor(extractor, image)
+    found = extractor.extract(image)
+    assert found.descriptors.shape == (len(found), 128)
+    assert found.codes is None
+    # By kornia's own chain of patches and network, for frames of six standard deviations; a diameter is two.
+    network = kornia.feature.HardNet(pretrained=False)
+    network.load_state_dict(torch.load(weights, weights_only=True)["state_dict"])
+    sift = Sift(max_keypoints=20).extract(image)
+    assert sift.frames is not None
+    grey = torch.from_numpy(image.transpose(2, 0, 1).copy())[None].float() / 255
+    frames = kornia.feature.laf_from_center_scale_ori(
+        torch.from_numpy(sift.keypoints - 0.5)[None], torch.from_numpy(3 * sift.frames[:, :1])[None, :, :, None]
+    )
+    describe = kornia.feature.LAFDescriptor(network.eval(), 32)
+    with torch.inference_mode():
+        reference = describe(kornia.color.rgb_to_grayscale(grey), frames)[0].numpy()
+    np.testing.assert_allclose(found.descriptors, reference, atol=1e-4)
+
+
+def test_hardnet_looks_where_torch_hub_keeps_it(weights: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path / "hub"))
+    assert HardNet(weights=Path("hub")).weights == weights
+    weights.unlink()
+    with pytest.raises(UserError, match=r"call kornia.feature.HardNet\(pretrained=True\) once, or give weights=FILE"):
+        HardNet(weights=Path("hub"))
+
+
+def test_hardnet_without_weights_or_kornia(weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(UserError, match="no such file"):
+        HardNet(weights=tmp_path / "absent.pth")
+    (tmp_path / "other.pth").write_bytes(b"something else")
+    with pytest.raises(UserError, match="not kornia's"):
+        HardNet(weights=tmp_path / "other.pth").extract(np.asarray(texture(0, (256, 256))))
+    without(monkeypatch, "kornia")
+    texture(0).save(tmp_path / "a.png")
+    moved = weights.rename(tmp_path / "moved.pth")
+    with pytest.raises(UserError, match="hardnet needs kornia: pip install"):
+        HardNet(weights=moved).extract(np.asarray(Image.open(tmp_path / "a.png")))
+
+
+def without(monkeypatch: pytest.MonkeyPatch, package: str) -> None:
+    """As if a package were not installed."""
+    imported = builtins.__import__
+
+    def refuse(name: str, *more: Any) -> Any:
+        if name.partition(".")[0] == package:
+            raise ImportError(name)
+        return imported(name, *more)
+
+    monkeypatch.setattr(builtins, "__import__", refuse)
+
+
+# ---- TensorBoard
+
+
+def test_training_tells_tensorboard(tmp_path: Path) -> None:
+    events = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    from bench.inversion.log import Log
+
+    log = Log(tmp_path / "log")
+    for step in range(1, 4):
+        log.scalars({"loss": 1 / step, "rate": 0.5}, step)
+    log.close()
+    read = events.EventAccumulator(str(tmp_path / "log"))
+    read.Reload()
+    assert [(event.step, event.value) for event in read.Scalars("loss")] == [(1, 1.0), (2, 0.5), (3, pytest.approx(1 / 3))]
+    Log(None).scalars({"loss": 1.0}, 1)
+
+
+def test_no_tensorboard_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
+    import sys
+
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)  # an import of it fails
+    images = album(tmp_path / "photos", 3)
+    arguments = ["--defense", "none", "--images", str(images), "--out", str(tmp_path / "w"), "--log", str(tmp_path / "log")]
+    assert cli.main(["train", *arguments, "--steps", "1"]) == 2
+    assert "--log needs tensorboard: pip install" in capfd.readouterr().err
+    assert not (tmp_path / "log").exists()

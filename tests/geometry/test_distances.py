@@ -1,0 +1,64 @@
+"""Distances of all pairs against least squares, one pair after the other."""
+
+import numpy as np
+import pytest
+import torch
+from subspace_cases import residual, subspaces
+
+from bench.codebook.examples import example_features
+from bench.geometry.distances import mutual, points_to_points, subspaces_to_points, subspaces_to_subspaces
+from bench.geometry.nearest_words import unit_rows
+from bench.types import Floats
+
+D = 128
+
+
+def descriptors(count: int, seed: int = 5) -> Floats:
+    return unit_rows(example_features(count, seed=seed).descriptors)
+
+
+@pytest.mark.parametrize("dim", [1, 2, 4, 8])
+def test_points_and_subspaces(rng: np.random.Generator, dim: int) -> None:
+    release, points = subspaces(rng, 7, dim), descriptors(9)
+    expected = [[residual(release.bases[n].T, u - release.origins[n]) for u in points] for n in range(len(release))]
+    found = subspaces_to_points(release, torch.from_numpy(points)).sqrt().numpy()
+    np.testing.assert_allclose(found, expected, atol=1e-4)
+
+
+@pytest.mark.parametrize(("dim", "other"), [(2, 2), (4, 2), (8, 8)])
+def test_two_subspaces(rng: np.random.Generator, dim: int, other: int) -> None:
+    one, two = subspaces(rng, 11, dim), subspaces(rng, 600, other)
+    found = subspaces_to_subspaces(one, two).sqrt().numpy()
+    assert found.shape == (11, 600)
+    for n in range(len(one)):
+        for k in range(0, len(two), 37):
+            columns = np.concatenate([one.bases[n], two.bases[k]]).T
+            assert found[n, k] == pytest.approx(residual(columns, two.origins[k] - one.origins[n]), abs=1e-3)
+
+
+def test_points() -> None:
+    one, other = descriptors(6), descriptors(8, seed=6)
+    expected = np.linalg.norm(one[:, None] - other[None], axis=2) ** 2
+    np.testing.assert_allclose(points_to_points(torch.from_numpy(one), torch.from_numpy(other)).numpy(), expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("ratio", [1.0, 0.8])
+def test_mutually_nearest_against_loops(rng: np.random.Generator, ratio: float) -> None:
+    squared = rng.integers(1, 200, (30, 40)).astype(np.float32)  # ties
+    expected = []
+    for row in range(30):
+        column = min(range(40), key=lambda c: (squared[row, c], c))
+        back = min(range(30), key=lambda r: (squared[r, column], r))
+        second = sorted(squared[row])[1]
+        if back == row and (ratio == 1 or np.sqrt(squared[row, column]) < ratio * np.sqrt(second)):
+            expected.append((row, column))
+    rows, columns = mutual(torch.from_numpy(squared), ratio)
+    assert list(zip(rows.tolist(), columns.tolist(), strict=True)) == expected
+    assert 0 < len(expected) < 30
+
+
+def test_nothing_is_nearest_to_nothing() -> None:
+    for shape in ((0, 3), (3, 0)):
+        rows, columns = mutual(torch.zeros(shape))
+        assert len(rows) == len(columns) == 0
+    assert mutual(torch.ones(1, 1), 0.8)[0].tolist() == [0]  # one column has no second

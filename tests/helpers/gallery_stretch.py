@@ -1,0 +1,9 @@
+"""A stretch of a walk through the gallery: references, and queries between them."""
+
+from bench.datasets.gallery import Gallery
+
+WALK = Gallery(views=150, rooms=1, width=320, height=240, detail=0.5)
+STRETCH = range(84, 104)  # along one wall of the courtyard
+QUERY = 4  # every so-manieth view of it
+WORDS = 300
+KEPT = [place for place in range(len(STRETCH)) if place % QUERY != QUERY // 2]  # as references

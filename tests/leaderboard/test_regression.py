@@ -1,0 +1,256 @@
+"""The regression check: a weakened attack and a broken defense must fail it, and chance must not."""
+
+import copy
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from fake_plugins.guess import Guess
+from fakes import FAKES, album, install
+from scipy import stats
+
+import bench
+from bench import cli
+from bench.api import View
+from bench.codebook.examples import small_dictionary
+from bench.geometry.nearest_words import unit_rows
+from bench.tasks.reconstruction import Reconstruction
+from bench.types import Features, WordSets
+from defenses.ldp import LDP
+from leaderboard import regression_report, speed
+from leaderboard.regression import Finding, compare, tolerance
+
+Records = list[dict[str, Any]]
+SEEDS = range(2)
+PAINTED = Reconstruction(inverter="painter")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """With photographs in it, and the fake plugins installed for as long as it is used."""
+    made = tmp_path_factory.mktemp("regression")
+    album(made / "album", 3)
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        install(made / "installed", monkeypatch, FAKES)
+        yield made
+
+
+@pytest.fixture(scope="module")
+def before(folder: Path) -> Records:
+    return measured(folder, SEEDS)
+
+
+def measured(folder: Path, seeds: range, epsilon: float = 8.0) -> Records:
+    """The first word of each set as a guess, at an ε where about every second set holds the true one."""
+    defense = LDP(epsilon=epsilon, dictionary=small_dictionary(folder))
+    return [record for seed in seeds for record in bench.run([defense], [Guess()], folder / "album", task=PAINTED, seed=seed)]
+
+
+def verdicts(found: list[Finding]) -> dict[str, str]:
+    return {finding.metric: finding.verdict for finding in found}
+
+
+# ---- what must pass, and what must fail
+
+
+def test_the_same_again_is_the_same(folder: Path, before: Records) -> None:
+    found = compare(before, copy.deepcopy(before))
+    assert {finding.verdict for finding in found} == {"same"}
+    assert {"angle", "l2", "recovered"} <= set(verdicts(found))
+
+
+def test_other_seeds_are_within_the_tolerance(folder: Path, before: Records) -> None:
+    """And differ, so that something was tolerated."""
+    found = compare(before, measured(folder, range(2, 4)))
+    assert {finding.verdict for finding in found} == {"same"}
+    assert any(finding.before != finding.after for finding in found)
+
+
+def test_a_weakened_attack_fails(folder: Path, before: Records, monkeypatch: pytest.MonkeyPatch) -> None:
+
+    def blunt(self: Guess, view: View, rng: np.random.Generator) -> np.ndarray:
+        assert isinstance(view.release, WordSets)
+        return unit_rows(rng.normal(size=view.release.candidates[:, 0].shape).astype(np.float32))
+
+    monkeypatch.setattr(Guess, "recover", blunt)
+    found = verdicts(compare(before, measured(folder, SEEDS)))
+    assert found["recovered"] == found["angle"] == "weaker"
+    assert "better" not in found.values()
+
+
+def test_a_broken_defense_fails(folder: Path, before: Records, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that always tells the true word first."""
+    protect = LDP.protect
+
+    def telling(self: LDP, secret: Features, public: Any, rng: np.random.Generator) -> WordSets:
+        release = protect(self, secret, public, rng)
+        release.candidates[:, 0] = secret.descriptors
+        return release
+
+    monkeypatch.setattr(LDP, "protect", telling)
+    found = verdicts(compare(before, measured(folder, SEEDS)))
+    assert found["recovered"] == found["angle"] == "worse"
+
+
+def test_a_defense_whose_source_is_another_may_get_better(folder: Path, before: Records, monkeypatch: pytest.MonkeyPatch) -> None:
+    protect = LDP.protect
+
+    def silent(self: LDP, secret: Features, public: Any, rng: np.random.Generator) -> WordSets:
+        release = protect(self, secret, public, rng)
+        release.candidates[:] = unit_rows(rng.normal(size=release.candidates[:, 0].shape).astype(np.float32))[:, None]
+        return release
+
+    monkeypatch.setattr(LDP, "protect", silent)
+    after = measured(folder, SEEDS)
+    assert verdicts(compare(before, after))["recovered"] == "weaker"
+    for record in after:
+        record["sources"]["defense"] = "sha256:another"
+    assert verdicts(compare(before, after))["recovered"] == "better"
+
+
+def test_a_weaker_promise_is_worse_without_tolerance(folder: Path, before: Records) -> None:
+    after = copy.deepcopy(before)
+    for record in after:
+        record["privacy"] |= {"epsilon_descriptor": 8.5}
+    assert verdicts(compare(before, after))["epsilon_descriptor"] == "worse"
+    assert verdicts(compare(after, before))["epsilon_descriptor"] == "better"
+    for record in after:
+        record["privacy"] |= {"guarantee": "none", "epsilon_descriptor": None}
+    assert verdicts(compare(before, after))["epsilon_descriptor"] == "worse"
+
+
+def test_lost_units_failures_and_cells(folder: Path, before: Records) -> None:
+    broken = [
+        record | {"status": "failed", "reason": "out of paper"} if record["unit"] == "1.png" else record for record in before
+    ]
+    (lost,) = [finding for finding in compare(before, broken) if finding.verdict == "missing"]
+    assert lost.told == "1 of 3 units: 1.png: out of paper"
+    other = measured(folder, range(1), epsilon=9.0)
+    assert [finding.verdict for finding in compare(before, other)] == ["missing", "new"]
+
+
+def test_another_metric_makes_no_other_cell_and_other_settings_cannot_be_compared(before: Records) -> None:
+    after = copy.deepcopy(before)
+    for record in after:
+        record["metric_settings"] |= {"more": {}, "ssim": {"sigma": 2.0}}
+    found = verdicts(compare(before, after))
+    assert found["ssim"] == "missing"
+    assert found["recovered"] == "same"
+
+
+def test_utility_has_its_own_direction() -> None:
+    """Recall of localization, which no attack takes part in."""
+
+    def judged(recall: float) -> Records:
+        head = {"cell_id": "0", "schema": 1, "task": "localization", "defense": {"name": "none"}, "attack": None, "dataset": {}}
+        head |= {"status": "ok", "privacy": {"guarantee": "none", "epsilon_descriptor": None}}
+        return [head | {"unit": str(unit), "metrics": {"recall_0.25m_2deg": recall}} for unit in range(5)]
+
+    assert verdicts(compare(judged(0.9), judged(0.5))) == {"recall_0.25m_2deg": "worse"}
+    assert verdicts(compare(judged(0.5), judged(0.9))) == {"recall_0.25m_2deg": "better"}
+
+
+# ---- tolerances, against an independent reference
+
+
+def drawn(rng: np.random.Generator, units: int, seeds: int, spread: float) -> dict[str, list[float]]:
+    heights = np.linspace(0, 50, units)
+    return {str(unit): (heights[unit] + rng.normal(0, spread, seeds)).tolist() for unit in range(units)}
+
+
+def test_tolerance_of_one_unit_is_that_of_students_test(rng: np.random.Generator) -> None:
+    before, after = drawn(rng, 1, 5, 2.0), drawn(rng, 1, 4, 2.0)
+    reference = stats.ttest_ind(after["0"], before["0"]).confidence_interval(0.999)
+    assert tolerance(before, after, 0.0) == pytest.approx((reference.high - reference.low) / 2)
+
+
+def test_false_alarms_are_rare_and_shifts_are_found(rng: np.random.Generator) -> None:
+    """Units differ by far more than seeds do, which must not matter."""
+
+    def apart(shift: float) -> bool:
+        before, after = drawn(rng, 7, 3, 1.0), drawn(rng, 7, 3, 1.0)
+        gap = np.mean([np.mean(after[unit]) + shift - np.mean(before[unit]) for unit in before])
+        return bool(abs(gap) > tolerance(before, after, 0.0))
+
+    assert sum(apart(0.0) for _ in range(2000)) <= 10  # two are expected
+    assert sum(apart(3.0) for _ in range(200)) >= 198
+
+
+def test_one_seed_takes_the_spread_over_units_and_one_unit_the_floor() -> None:
+    before = {str(unit): [0.0] for unit in range(7)}
+    steady = {str(unit): [0.1 + unit / 1000] for unit in range(7)}
+    mixed = {str(unit): [0.3 * (-1) ** unit] for unit in range(7)}
+    assert tolerance(before, steady, 0.01) == 0.01  # all units moved alike
+    assert tolerance(before, mixed, 0.01) > 0.2
+    assert tolerance({"0": [0.0]}, {"0": [5.0]}, 0.01) == 0.01
+
+
+# ---- the command
+
+
+@pytest.fixture
+def folders(before: Records, tmp_path: Path) -> tuple[Path, Path]:
+    worse = [record | {"metrics": record["metrics"] | {"recovered": 1.0}} for record in before]
+    for name, held in (("before", before), ("after", worse)):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "records.jsonl").write_text("".join(json.dumps(record) + "\n" for record in held))
+    return tmp_path / "before" / "records.jsonl", tmp_path / "after"
+
+
+def test_command_tells_and_exits_with_3(folders: tuple[Path, Path], capfd: pytest.CaptureFixture[str]) -> None:
+    baseline, results = map(str, folders)
+    assert cli.main(["check", "--baseline", baseline, "--results", baseline]) == 0
+    shown = capfd.readouterr().out
+    assert "same" in shown
+    assert "worse" not in shown
+    assert cli.main(["check", "--baseline", baseline, "--results", results]) == 3
+    shown = capfd.readouterr().out
+    assert "worse" in shown
+    assert "recovered" in shown
+    Path(results, "records.jsonl").write_text("")
+    assert cli.main(["check", "--baseline", baseline, "--results", results]) == 1
+    assert "1 missing" in capfd.readouterr().out
+
+
+def test_annotations_are_escaped(folders: tuple[Path, Path], capfd: pytest.CaptureFixture[str]) -> None:
+    baseline, results = map(str, folders)
+    assert cli.main(["check", "--baseline", baseline, "--results", results, "--format", "github"]) == 3
+    (line, _) = capfd.readouterr().out.splitlines()
+    assert line.startswith("::error title=worse%3A ldp%3Aepsilon=8%2Csubset_size=2%2Cwords=0 against guess::recovered was 0.")
+    nasty = Finding(verdict="missing", defense="a::b,100%\r\n::error::", attack="c", told="50%\r\n::stop-commands::x")
+    written = regression_report.to_github(nasty)
+    assert written == (
+        "::warning title=missing%3A a%3A%3Ab%2C100%25%0D%0A%3A%3Aerror%3A%3A against c::50%25%0D%0A::stop-commands::x"
+    )
+
+
+# ---- speed, as ratios
+
+
+def timed(path: Path, **minutes: float) -> Path:
+    names = {"bare": "test_speed_of_the_bare_product[float32]", "search": "test_speed_of_the_search"}
+    rows = [{"group": "nearest word", "name": names[name], "stats": {"min": time}} for name, time in minutes.items()]
+    path.write_text(json.dumps({"benchmarks": [*rows, {"group": None, "name": "test_alone", "stats": {"min": 1.0}}]}))
+    return path
+
+
+def test_speed_is_compared_as_ratios(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    good = speed.ratios(timed(tmp_path / "good.json", bare=1.0, search=1.5))
+    assert good == {"nearest word: test_speed_of_the_search": 1.5}
+    baseline = tmp_path / "speed.json"
+    baseline.write_text(json.dumps(good))
+    slow_machine = timed(tmp_path / "slow.json", bare=10.0, search=16.0)
+    slow_code = timed(tmp_path / "worse.json", bare=1.0, search=3.2)
+    assert cli.main(["check", "--baseline", str(baseline), "--results", str(slow_machine)]) == 0
+    assert cli.main(["check", "--baseline", str(baseline), "--results", str(slow_code)]) == 3
+    assert "nearest word" in capfd.readouterr().out
+
+
+@pytest.mark.parametrize("content", ["[]", "{", '{"a": "b"}'])
+def test_wrong_files_of_speed_are_one_line(tmp_path: Path, capfd: pytest.CaptureFixture[str], content: str) -> None:
+    (tmp_path / "speed.json").write_text(content)
+    assert cli.main(["check", "--baseline", str(tmp_path / "speed.json"), "--results", str(tmp_path / "absent.json")]) == 2
+    assert capfd.readouterr().err.count("\n") == 1

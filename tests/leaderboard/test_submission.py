@@ -1,0 +1,270 @@
+"""Checking somebody's records: each lie is told with its line, and what is honest passes."""
+
+import copy
+import dataclasses
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from fake_plugins.guess import Guess
+from fake_plugins.peeker import Peeker
+from fakes import album, install, scene
+
+import bench
+from bench import cli
+from bench.api import View
+from bench.codebook.examples import small_dictionary
+from bench.codebook.public import Public
+from bench.extractors.sift import Sift
+from bench.localization.scene_index import Place
+from bench.localization.server import Server
+from bench.runner import records
+from bench.runner.attack_process import isolated
+from bench.tasks.reconstruction import Reconstruction
+from bench.types import Knowledge, Subspaces
+from defenses.affine import Affine
+from defenses.ldp import LDP
+from defenses.none import Undefended
+from leaderboard import submission
+from leaderboard.submission import Fault
+
+Lines = list[dict[str, Any]]
+PLUGINS = {"feature_privacy.attacks": {name: f"fake_plugins.{name}:PLUGIN" for name in ("painter", "guess", "peeker")}}
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Photographs, a dictionary, and the fake plugins installed."""
+    made = tmp_path_factory.mktemp("submission")
+    album(made / "album", 2)
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        install(made / "installed", monkeypatch, PLUGINS)
+        yield made
+
+
+@pytest.fixture(scope="module")
+def honest(place: Path) -> Lines:
+    """Two records of a pair that applies, and one of a pair that does not."""
+    return sorted(run(place, Guess(), Undefended()), key=lambda record: record["status"], reverse=True)
+
+
+def run(place: Path, attack: Any, *more: Any) -> Lines:
+    ldp = LDP(epsilon=8.0, dictionary=small_dictionary(place))
+    return bench.run([ldp, *more], [attack], place / "album", task=Reconstruction(inverter="painter"))
+
+
+@pytest.fixture
+def faults(place: Path, tmp_path: Path) -> Callable[..., list[Fault]]:
+    def check(lines: Lines | str, sample: int = 0) -> list[Fault]:
+        path = tmp_path / "records.jsonl"
+        path.write_text(lines if isinstance(lines, str) else "".join(json.dumps(line) + "\n" for line in lines))
+        (dictionary,) = place.glob("dictionary-*.safetensors")
+        return submission.check(path, images=place / "album", files=[dictionary], sample=sample)[1]
+
+    return check
+
+
+def test_honest_records_pass_and_come_out_again(faults: Callable[..., list[Fault]], honest: Lines) -> None:
+    assert [record["status"] for record in honest] == ["ok", "ok", "n/a"]
+    assert faults(honest, sample=1) == []
+
+
+def test_what_looks_at_the_secret_is_found(faults: Callable[..., list[Fault]], place: Path) -> None:
+    """Every number of its records is what `bench run` measured; only the other process tells."""
+    cheating = run(place, Peeker())
+    assert all(record["metrics"]["recovered"] == 1 for record in cheating)
+    assert faults(cheating) == []
+    found = faults(cheating, sample=2)
+    assert {fault.line for fault in found} == {1, 2}
+    assert any(fault.what.startswith("metrics.recovered: is 1, and 0.") for fault in found)
+
+
+def test_another_number_is_found(faults: Callable[..., list[Fault]], honest: Lines) -> None:
+    lied = copy.deepcopy(honest[:2])
+    lied[1]["metrics"]["recovered"] *= 0.5
+    assert [fault.line for fault in faults(lied, sample=2)] == [2]
+
+
+def change(*path: str, to: Any) -> Callable[[dict[str, Any]], None]:
+    def changed(record: dict[str, Any]) -> None:
+        *above, last = path
+        for part in above:
+            record = record[part]
+        record[last] = to
+
+    return changed
+
+
+def hashed_again(record: dict[str, Any]) -> None:
+    """As someone who lies with care would."""
+    task = {"name": record["task"], **record["task_settings"]}
+    parts = (task, record["defense"], record["attack"], record["dataset"], record["seed"], record["metric_settings"])
+    record["cell_id"] = records.cell_id(*parts)
+    record["run_hash"] = records.run_hash(record["cell_id"], record["environment"])
+
+
+@pytest.mark.parametrize(
+    ("lie", "complaint"),
+    [
+        (lambda record: record.pop("seed"), "the record: 'seed' is a required property"),
+        (change("more", to=1), "the record: Additional properties are not allowed"),
+        (change("seconds", to="1"), "seconds: '1' is not of type 'number'"),
+        (change("metrics", "ssim", to=True), "metrics.ssim: True is not of type"),
+        (change("unit", to=7), "unit: 7 is not of type 'string'"),
+        (change("privacy", "private", to=True), "privacy.private: False was expected"),
+        (change("status", to="good"), "status: 'good' is not one of"),
+        (change("reason", to="why"), "reason: 'why' is not of type 'null'"),
+        (change("defense", "epsilon", to=9.0), "cell_id: is "),
+        (change("environment", "threads", to=99), "run_hash: is "),
+        (change("metrics", "ssim", to=1.5), "metrics.ssim: 1.5 is not from -1 to 1"),
+        (change("metrics", "keypoints", to=3), "privacy.keypoints: not the keypoints"),
+        (change("privacy", "epsilon_image", to=1.0), "privacy.epsilon_image: is 1.0, should be "),
+        (change("privacy", "guarantee", to="perfect"), "privacy.guarantee: is perfect, should be epsilon-ldp"),
+        (change("unit", to="7.png"), "unit: the dataset has no '7.png'"),
+    ],
+)
+def test_lies_about_one_record(faults: Callable[..., list[Fault]], honest: Lines, lie: Any, complaint: str) -> None:
+    lied = copy.deepcopy(honest)
+    lie(lied[1])
+    told = [fault.what for fault in faults(lied) if fault.line == 2]
+    assert any(what.startswith(complaint) for what in told), told
+
+
+@pytest.mark.parametrize(
+    ("lie", "complaint"),
+    [
+        (change("defense", "name", to="lpd"), "unknown defense 'lpd'; did you mean 'ldp'?"),
+        (change("defense", "subset_size", to="many"), "ldp: subset_size must be a whole number"),
+        (change("defense", "dictionary", to="sha256:" + "0" * 64), "defense.dictionary is sha256:000"),
+        (change("dataset", "hash", to="sha256:" + "0" * 64), "dataset.hash is sha256:000"),
+        (change("metric_settings", "ssim", to={}), "metric_settings.ssim is {}"),
+    ],
+)
+def test_lies_about_a_cell_that_are_hashed_again(
+    faults: Callable[..., list[Fault]], honest: Lines, lie: Any, complaint: str
+) -> None:
+    lied = copy.deepcopy(honest[:2])
+    for record in lied:
+        lie(record)
+        hashed_again(record)
+    (fault,) = faults(lied)
+    assert fault.line == 1
+    assert complaint in fault.what
+
+
+def test_pairs_that_do_not_apply_and_pairs_that_do(faults: Callable[..., list[Fault]], honest: Lines) -> None:
+    silent = [record | {"status": "n/a", "reason": "no", "metrics": {}, "seconds": None} for record in honest[:2]]
+    assert any("applies, but the record says n/a" in fault.what for fault in faults(silent))
+    bold = honest[0] | {name: honest[2][name] for name in ("defense", "attack", "cell_id", "run_hash")}
+    assert any("does not apply (guess attacks" in fault.what for fault in faults([bold]))
+
+
+def test_left_out_and_repeated(faults: Callable[..., list[Fault]], honest: Lines) -> None:
+    assert faults(honest[:1]) == [Fault(1, "its cell lacks 1 of 2 units, such as '1.png'")]
+    assert faults([*honest[:2], honest[0]]) == [Fault(3, "the same unit of the same cell as line 1")]
+    failed = honest[0] | {"status": "failed", "reason": "tired", "metrics": {}, "seconds": None}
+    assert faults([failed, *honest[:2]]) == []
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("{", "no JSON"),
+        ('{"seconds": NaN}', "NaN is no number"),
+        ("[]", "the record: [] is not of type 'object'"),
+        ("", "there is no"),
+    ],
+)
+def test_lines_that_are_no_records(faults: Callable[..., list[Fault]], text: str, complaint: str) -> None:
+    assert complaint in faults(text)[0].what
+
+
+def test_numbers_too_large_for_a_double(faults: Callable[..., list[Fault]], honest: Lines) -> None:
+    text = json.dumps(honest[0] | {"seconds": 0.125}).replace('"seconds": 0.125', '"seconds": 1e999')
+    assert Fault(1, "seconds: not finite") in faults(text)
+
+
+def test_command(honest: Lines, place: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "records.jsonl"
+    path.write_text(json.dumps(honest[0] | {"unit": "\x1b[31m\n::error::"}) + "\n")
+    (dictionary,) = map(str, place.glob("dictionary-*.safetensors"))
+    beside = ["--images", str(place / "album"), "--file", dictionary, "--sample", "0"]
+    assert cli.main(["submit-check", str(path), *beside]) == 1
+    shown, told = capfd.readouterr()
+    assert all(line.startswith("line 1: ") for line in shown.splitlines())
+    assert "\x1b" not in shown
+    assert "faults in 1 records" in told
+    path.write_text("".join(json.dumps(record) + "\n" for record in honest))
+    assert cli.main(["submit-check", str(path), *beside]) == 0
+    assert cli.main(["submit-check", str(tmp_path / "absent")]) == 2
+    assert cli.main(["submit-check", str(path), "--file", str(path)]) == 2
+
+
+# ---- the other process
+
+
+def seen(needs: frozenset[Knowledge]) -> View:
+    """A release with others beside it, and a database."""
+    known = {
+        Knowledge.OTHER_RELEASES: lambda: lambda count: iter([released(seed) for seed in range(count)]),
+        Knowledge.PUBLIC_DATABASE: lambda: "a database",
+    }
+    return View(release=released(0), defense=Affine(), extractor=Sift(), knowledge={what: known[what] for what in needs})
+
+
+def released(seed: int) -> Subspaces:
+    rng = np.random.default_rng(seed)
+    bases = np.linalg.qr(rng.normal(size=(5, 128, 2)))[0].transpose(0, 2, 1).astype(np.float32)
+    return Subspaces(
+        keypoints=np.zeros((5, 2), np.float32), size=(9, 9), origins=rng.normal(size=(5, 128)).astype(np.float32), bases=bases
+    )
+
+
+def summed(view: View, rng: np.random.Generator) -> np.ndarray:
+    """Uses all that it is given, and tells what it has not been given."""
+    others = list(view.know(Knowledge.OTHER_RELEASES)(3))
+    view.notes.append(view.know(Knowledge.PUBLIC_DATABASE))
+    try:
+        view.know(Knowledge.DATABASE)
+    except PermissionError as error:
+        view.notes.append(str(error))
+    return np.asarray(sum(other.origins for other in others) + rng.normal(size=(5, 128)), np.float32)
+
+
+def broken(view: View, rng: np.random.Generator) -> np.ndarray:
+    raise ArithmeticError("lost count")
+
+
+def test_the_other_process_does_as_this_one() -> None:
+    needs = frozenset({Knowledge.OTHER_RELEASES, Knowledge.PUBLIC_DATABASE})
+    here, there = seen(needs), seen(needs)
+    one, other = np.random.default_rng(3), np.random.default_rng(3)
+    assert np.array_equal(isolated(summed, there, other), summed(here, one))
+    assert here.notes == there.notes == ["a database", "this attack did not declare DATABASE in its `needs`"]
+    assert one.random() == other.random()
+
+
+def camera_and_references(view: View, rng: np.random.Generator) -> np.ndarray:
+    served = view.know(Knowledge.MAP)
+    assert not served.place.scene.queries
+    names = [reference.name for reference in served.place.scene.references]
+    return np.array([served.camera.params[0], len(names), names[0].count("/")], np.float32)
+
+
+def test_the_map_comes_without_the_queries(tmp_path: Path) -> None:
+    """One of which is the secret."""
+    whole = scene(tmp_path)
+    public = Public(place=Place(whole, Sift()))
+    asked = seen(frozenset())
+    served = Server(public=public, camera=whole.queries[0].camera)
+    asked = dataclasses.replace(asked, knowledge={Knowledge.MAP: lambda: served})
+    found = isolated(camera_and_references, asked, np.random.default_rng(0))
+    assert found.tolist() == [np.float32(75.1), len(whole.references), 1]
+
+
+def test_errors_come_back() -> None:
+    with pytest.raises(RuntimeError, match="lost count"):
+        isolated(broken, seen(frozenset()), np.random.default_rng(0))

@@ -1,0 +1,181 @@
+"""Matching: the measures against brute force, and pairs that must be matched, or must not."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fakes import texture, trial
+
+import bench
+from bench.api import Asset, Defense, Outcome
+from bench.codebook.examples import example_features, small_dictionary
+from bench.codebook.public import Public
+from bench.core.errors import UserError
+from bench.geometry.shared_words import sharing
+from bench.images.scene import File
+from bench.localization import two_view_matching
+from bench.rendering.homographies import Pair
+from bench.tasks.matching import WITHIN, Matching, accuracy, transferred
+from bench.testing import shot
+from bench.types import Features, Release
+from defenses.affine import Affine
+from defenses.ldp import LDP
+from defenses.naive_ldp import NaiveLDP
+from defenses.none import Undefended
+
+SECRET = example_features(60, seed=3)
+TURN = np.array([[0.9, 0.1, 3.0], [-0.1, 0.9, 8.0], [1e-3, 0, 1]])
+
+
+@pytest.fixture
+def words(tmp_path: Path) -> Asset:
+    return small_dictionary(tmp_path, 5_000)
+
+
+def test_measures_by_enumeration(rng: np.random.Generator) -> None:
+    first, second = (rng.uniform(0, 60, (count, 2)).astype(np.float32) for count in (40, 50))
+    error = np.empty((40, 50))
+    for i, j in np.ndindex(error.shape):
+        x, y, depth = TURN @ [*first[i], 1]
+        error[i, j] = np.hypot(x / depth - second[j, 0], y / depth - second[j, 1])
+    nearest = np.stack([np.arange(0, 40, 2), error[::2].argmin(axis=1)], axis=1)
+    matches = np.unique(np.concatenate([nearest, rng.integers(0, 40, (30, 2))]), axis=0)
+    errors = np.array([error[i, j] for i, j in matches])
+    possible = {i for i in range(40) if error[i].min() < 3}
+    right = {int(i) for (i, _), off in zip(matches, errors, strict=True) if off < 3}
+    found = accuracy(first, second, TURN, matches)
+    assert found["correspondences"] == len(possible)
+    assert found["recall"] == pytest.approx(len(right & possible) / len(possible))
+    assert found["precision"] == found["mma_03px"] == pytest.approx((errors < 3).mean())
+    assert [found[f"mma_{t:02}px"] for t in WITHIN] == pytest.approx([(errors < t).mean() for t in WITHIN])
+    assert 0 < len(right) < len(possible) < 40
+
+
+def test_where_nothing_is_matched_all_is_zero() -> None:
+    points = np.array([[5, 5], [9, 9]], np.float32)
+    found = accuracy(points, points, np.eye(3), np.empty((0, 2), np.int64))
+    assert (found["precision"], found["recall"], found["mma_10px"], found["matches"]) == (0, 0, 0, 0)
+    assert accuracy(points, points + 50, np.eye(3), np.empty((0, 2), np.int64))["recall"] is None
+
+
+def test_points_beyond_the_horizon_have_no_place() -> None:
+    behind = np.array([[1, 0, 0], [0, 1, 0], [-0.1, 0, 1.0]])
+    found = transferred(np.array([[5, 5], [10, 5], [20, 5]], np.float32), behind)
+    assert np.isfinite(found[0]).all()
+    assert np.isinf(found[1:]).all()
+    points = np.array([[20, 5]], np.float32)
+    assert accuracy(points, points, behind, np.array([[0, 0]]))["precision"] == 0
+
+
+@pytest.mark.parametrize("unique", [False, True])
+def test_words_in_common_by_enumeration(rng: np.random.Generator, unique: bool) -> None:
+    first, second = (np.stack([rng.choice(60, 3, replace=False) for _ in range(count)]) for count in (15, 12))
+    counts = [np.bincount(words.ravel(), minlength=60) for words in (first, second)]
+    good = np.flatnonzero((counts[0] == 1) & (counts[1] == 1) | (not unique))
+    expected = [[i, j] for i in range(15) for j in range(12) if set(first[i]) & set(second[j]) & set(good)]
+    assert sharing(first, second, unique).tolist() == expected
+    assert 0 < len(expected) < 15 * 12
+
+
+def test_words_in_common_where_there_is_little() -> None:
+    none, some = np.empty((0, 3), dtype=np.int64), np.array([[1, 2, 3], [1, 4, 5]])
+    assert sharing(none, some).shape == sharing(some, none).shape == sharing(some, some + 10).shape == (0, 2)
+    assert sharing(some, some, unique=True).tolist() == [[0, 0], [1, 1]]
+    assert sharing(some, some).tolist() == [[0, 0], [0, 1], [1, 0], [1, 1]]
+
+
+def released(defense: Defense, secret: Features = SECRET, seed: int = 0) -> Release:
+    return defense.protect(secret, Public(), np.random.default_rng(seed))
+
+
+DEFENSES: list[Callable[[Asset], Defense]] = [
+    lambda words: Undefended(),
+    lambda words: Affine(database=words, dim=2),
+    lambda words: LDP(dictionary=words, epsilon=20.0, subset_size=2),
+    lambda words: NaiveLDP(epsilon=1e6, subset_size=2),
+]
+
+
+@pytest.mark.parametrize("defense", DEFENSES)
+@pytest.mark.parametrize("both", [False, True])
+def test_the_same_features_match_themselves(words: Asset, defense: Callable[[Asset], Defense], both: bool) -> None:
+    plugin = defense(words)
+    second = released(plugin, seed=1) if both else two_view_matching.unprotected(SECRET, plugin, Public())
+    found = {tuple(pair) for pair in two_view_matching.matches(released(plugin), second).tolist()}
+    assert len({(i, i) for i in range(60)} & found) > 55
+    assert len(found) < 120
+
+
+@pytest.mark.parametrize("defense", DEFENSES)
+def test_strangers_do_not_match_more_than_chance(words: Asset, defense: Callable[[Asset], Defense]) -> None:
+    """Negative control: descriptors in another order."""
+    plugin, shuffled = defense(words), SECRET.take(np.random.default_rng(0).permutation(60))
+    found = two_view_matching.matches(released(plugin), two_view_matching.unprotected(shuffled, plugin, Public()))
+    assert (found[:, 0] == found[:, 1]).mean() < 0.15
+
+
+def judged(task: Matching, defense: Defense, secrets: tuple[Features, Features], homography: np.ndarray) -> Outcome:
+    """What a task says of a pair without photographs."""
+    made = trial(defense, secrets[0])
+    other = shot(secrets[1], released(defense, secrets[1], seed=5))
+    nowhere = File(path=Path("none"), size=(1, 1))
+    pair = Pair(name="pair", first=nowhere, second=nowhere, homography=homography)
+    unit = replace(made.unit, subject=pair)
+    return task.judge(replace(made, unit=unit, shots=(*made.shots, other)))
+
+
+def seen_again(homography: np.ndarray) -> tuple[Features, Features]:
+    keypoints = np.random.default_rng(0).uniform(0, 300, (60, 2)).astype(np.float32)
+    first = replace(SECRET, keypoints=keypoints)
+    return first, replace(SECRET, keypoints=transferred(keypoints, homography).astype(np.float32))
+
+
+@pytest.mark.parametrize("homography", [np.eye(3), TURN])
+def test_features_that_are_seen_again_give_everything(homography: np.ndarray) -> None:
+    found = judged(Matching(), Undefended(), seen_again(homography), homography).metrics
+    assert (found["precision"], found["recall"], found["mma_01px"], found["matches"]) == (1, 1, 1, 60)
+
+
+def test_shuffled_positions_give_chance() -> None:
+    """Negative control."""
+    first, second = seen_again(np.eye(3))
+    shuffled = replace(second, keypoints=np.random.default_rng(1).permutation(second.keypoints))
+    found = judged(Matching(), Undefended(), (first, shuffled), np.eye(3)).metrics
+    assert found["matches"] == 60
+    assert found["precision"] < 0.1
+
+
+def test_another_dictionary_matches_nothing(tmp_path: Path, words: Asset) -> None:
+    """Negative control: the same numbers stand for other words."""
+    release = released(LDP(dictionary=words, epsilon=20.0))
+    stranger = LDP(dictionary=small_dictionary(tmp_path, 5_000, seed=7), epsilon=20.0)
+    assert len(two_view_matching.matches(release, two_view_matching.unprotected(SECRET, stranger, Public()))) < 10
+
+
+def test_ratio_test_leaves_fewer_and_better_matches() -> None:
+    first, second = example_features(60, seed=1), example_features(80, seed=2)
+    all_of_them = two_view_matching.matches(released(Undefended(), first), released(Undefended(), second))
+    strict = two_view_matching.matches(released(Undefended(), first), released(Undefended(), second), ratio=0.8)
+    assert {tuple(pair) for pair in strict} < {tuple(pair) for pair in all_of_them}
+
+
+def test_runs_on_hpatches_and_on_pairs_that_are_made(tmp_path: Path) -> None:
+    (tmp_path / "v_wall").mkdir()
+    for number in range(1, 7):
+        texture(0, (160, 128)).save(tmp_path / "v_wall" / f"{number}.ppm")
+        np.savetxt(tmp_path / "v_wall" / f"H_1_{number}", np.eye(3))
+    records = bench.run([Undefended()], images=tmp_path, task=Matching())
+    assert [record["unit"] for record in records] == [f"v_wall-{number}" for number in range(2, 7)]
+    assert all(record["metrics"]["recall"] == record["metrics"]["mma_01px"] == 1 for record in records)
+
+
+def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
+    for wrong in ({"ratio": 0.0}, {"ratio": 1.1}, {"ratio": float("nan")}, {"each": 0}):
+        with pytest.raises(UserError, match="must be"):
+            Matching(**wrong)
+    with pytest.raises(UserError, match="no sequence of HPatches"):
+        Matching().collection(tmp_path, None)
+    with pytest.raises(UserError, match="give a folder of HPatches"):
+        Matching().collection([tmp_path], None)

@@ -1,0 +1,99 @@
+"""What an ε for a photograph leaves for each descriptor, and what the command says of it."""
+
+import json
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bench import cli
+from bench.core.errors import UserError
+from bench.mechanisms.budget import budget, nearest, yields
+from bench.mechanisms.composition import basic, optimal
+from bench.mechanisms.subset import word_subsets
+
+
+def test_what_is_left_costs_what_was_asked() -> None:
+    plan = budget(10.0, 800, 3, 256_000)
+    assert plan.by_basic == pytest.approx(10 / 2400)
+    assert basic(plan.by_basic, 2400) == pytest.approx(10)
+    assert optimal(plan.by_optimal, 2400) == pytest.approx(10)
+    assert plan.epsilon == plan.by_optimal > plan.by_basic
+    # Where each answer costs much, a small δ buys nothing.
+    assert budget(8000.0, 800, 1, 256_000).epsilon == pytest.approx(10.0, rel=1e-6)
+
+
+def test_what_that_gives_is_what_the_mechanism_gives() -> None:
+    plan = budget(8000.0, 800, 1, 1000)
+    assert [row.size for row in yields(plan)] == [1, 2, 4]  # at ε = 10 of 1000 words, one is the best size
+    plan = budget(optimal(3.0, 800), 800, 1, 1000)
+    rows = {row.size: row for row in yields(plan)}
+    assert set(rows) == {1, 2, 4, 47, 113}  # 1000 / (e³ + 1), and where mutual information is greatest
+    rng = np.random.default_rng(0)
+    true = rng.integers(1000, size=50_000)
+    for size, row in rows.items():
+        told = (word_subsets(true, 1000, 3.0, size, rng) == true[:, None]).any(axis=1).mean()
+        assert row.told == pytest.approx(told, abs=0.01)
+        assert row.true_words == pytest.approx(800 * told, abs=8)
+    assert max(rows.values(), key=lambda row: row.bits).size == 113
+
+
+def test_the_records_of_the_nearest_epsilon() -> None:
+    def record(epsilon: float | str | None) -> dict[str, Any]:
+        return {"privacy": {"epsilon_descriptor": epsilon}}
+
+    records = [record(epsilon) for epsilon in (None, 8.0, 10.0, 8.0, "inf", 0.0)]
+    assert nearest(records, 8.9) == [record(8.0)] * 2
+    assert nearest(records, 0.1) == [record(0.0)]
+    with pytest.raises(UserError, match="no record there claims an epsilon"):
+        nearest([record(None)], 1.0)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "complaint"),
+    [
+        ((-1.0, 10, 1, 100), "--image-epsilon: must be at least 0"),
+        ((math.nan, 10, 1, 100), "--image-epsilon: must be at least 0"),
+        ((1.0, 0, 1, 100), "at least 1 keypoint"),
+        ((1.0, 10, 0, 100), "released at least once"),
+        ((1.0, 10, 1, 1), "at least 2 words"),
+    ],
+)
+def test_mistakes(numbers: Any, complaint: str) -> None:
+    with pytest.raises(UserError, match=complaint):
+        budget(*numbers)
+
+
+def run(capfd: pytest.CaptureFixture[str], *arguments: Any) -> tuple[int, str, str]:
+    status = cli.main(["budget", *map(str, arguments)])
+    return status, *capfd.readouterr()
+
+
+def test_the_command(capfd: pytest.CaptureFixture[str]) -> None:
+    status, shown, _ = run(capfd, "--image-epsilon", "10", "--keypoints", 1000, "--words", 256_000)
+    assert status == 0
+    assert "basic composition leaves ε = 0.01 for a descriptor" in shown
+    left = float(re.search(r"δ = 1e-06 leaves ε = ([0-9.]+)", shown)[1])  # type: ignore[index]
+    assert optimal(left, 1000) == pytest.approx(10, rel=1e-3)
+    assert "not covered: the keypoints' positions, the number of keypoints" in shown
+    assert run(capfd, "--image-epsilon", "1/0")[0] == 2
+    assert run(capfd)[2] == "bench: --image-epsilon is missing (bench budget --help explains)\n"
+    assert run(capfd, "--image-epsilon", 0, "--words", 10)[0] == 0
+
+
+def test_what_was_measured_nearby(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    from record_lines import record
+
+    lines = [record(run_hash=str(e), privacy=record()["privacy"] | {"epsilon_descriptor": e}) for e in (8.0, 16.0)]
+    lines[1]["metrics"] = lines[1]["metrics"] | {"ssim": 0.777}
+    (tmp_path / "records.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    asked = ("--image-epsilon", 14_000, "--keypoints", 1000, "--words", 1000, "--results", tmp_path)
+    status, shown, _ = run(capfd, *asked)
+    assert status == 0
+    assert "0.777" in shown
+    assert "nearest that was measured: ε = 16" in shown
+    assert "0.777" not in run(capfd, "--image-epsilon", 10, *asked[2:])[1]
+    assert run(capfd, *asked[:-1], tmp_path / "none")[0] == 2

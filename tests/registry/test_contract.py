@@ -1,0 +1,150 @@
+"""One test of every registered plugin against what it claims."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from fakes import texture
+
+from bench.api import Attack, Defense, Extractor, Metric, Privacy, View
+from bench.cache import store
+from bench.codebook import dictionary
+from bench.codebook.examples import example_features, small_dictionary
+from bench.codebook.public import Public
+from bench.extractors.sift import Sift
+from bench.formats import tensor_file
+from bench.geometry.nearest_words import unit_rows
+from bench.images import photographs
+from bench.registry import discovery, fields, spec
+from bench.registry.discovery import Kind
+from bench.testing import check_applicability, check_attack, check_defense, check_extractor, check_metric
+from bench.types import Descriptors, Features
+from defenses.ldp import LDP
+
+
+def plugins(kind: Kind) -> Any:
+    return pytest.mark.parametrize("plugin", discovery.everything(kind), ids=lambda plugin: plugin.name())
+
+
+def built(plugin: type) -> Any:
+    if fields.without_default(plugin):
+        pytest.skip("has a field that must be given, and a test of its own")
+    return spec.build(plugin, {})
+
+
+@plugins(discovery.DEFENSE)
+def test_defense(plugin: type[Defense], tmp_path: Path) -> None:
+    defense = built(plugin)
+    small = small_dictionary(tmp_path)
+    check_defense(
+        dataclasses.replace(defense, **dict.fromkeys(fields.asset_fields(defense), small)), Public(), example_features()
+    )
+
+
+@plugins(discovery.METRIC)
+def test_metric(plugin: type[Metric]) -> None:
+    check_metric(built(plugin))
+
+
+@plugins(discovery.EXTRACTOR)
+def test_extractor(plugin: type[Extractor], tmp_path: Path) -> None:
+    check_extractor(built(plugin), photographs.square(texture(0), 256))
+
+
+PAIRS = [
+    pytest.param(attack, defense, id=f"{attack.name()}-{defense.name()}")
+    for attack in discovery.everything(discovery.ATTACK)
+    for defense in discovery.everything(discovery.DEFENSE)
+]
+
+
+@pytest.mark.parametrize(("attack", "defense"), PAIRS)
+def test_attack(attack: type[Attack], defense: type[Defense], tmp_path: Path) -> None:
+    attacker, defender = built(attack), built(defense)
+    if "database" in fields.asset_fields(attacker):
+        attacker = dataclasses.replace(attacker, database=small_dictionary(tmp_path))
+    if check_applicability(attacker, defender, Sift(), Public()):
+        check_attack(attacker, defender, Sift(), example_features(20))
+
+
+# ---- negative controls: each breaks one promise, and its check notices
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Leaky(Defense):
+    releases = Descriptors
+
+    def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> Descriptors:
+        return Descriptors(keypoints=secret.keypoints.copy(), size=secret.size, descriptors=secret.descriptors)
+
+    def privacy(self, public: Public) -> Privacy:
+        return Privacy("none")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Shifted(Leaky):
+    def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> Descriptors:
+        return Descriptors(keypoints=secret.keypoints + 1, size=secret.size, descriptors=secret.descriptors.copy())
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Careless(Leaky):
+    def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> Descriptors:
+        order = np.random.default_rng().permutation(len(secret))  # its own randomness
+        return Descriptors(keypoints=secret.keypoints.copy(), size=secret.size, descriptors=secret.descriptors[order])
+
+
+@pytest.mark.parametrize(
+    ("defense", "complaint"), [(Leaky(), "shares memory"), (Shifted(), "keypoints"), (Careless(), "same rng")]
+)
+def test_wrong_defense_is_noticed(defense: Defense, complaint: str) -> None:
+    with pytest.raises(AssertionError, match=complaint):
+        check_defense(defense, Public(), example_features())
+
+
+def test_an_extractor_that_keeps_the_order_of_responses_is_noticed() -> None:
+    class Ranked(Sift):
+        def extract(self, image: np.ndarray, source: Path | None = None) -> Features:
+            found = super().extract(image, source)
+            return dataclasses.replace(
+                found, keypoints=found.keypoints[::-1], descriptors=found.descriptors[::-1], codes=found.codes[::-1]
+            )
+
+    with pytest.raises(AssertionError, match="order of keypoints"):
+        check_extractor(Ranked(), photographs.square(texture(0), 256))
+
+
+def test_peeking_attack_is_noticed() -> None:
+    from fake_plugins.guess import Guess
+
+    class Peeking(Guess):
+        accepts = (Descriptors,)
+
+        def recover(self, view: View, rng: np.random.Generator) -> np.ndarray:
+            assert isinstance(view.release, Descriptors)
+            return view.release.descriptors
+
+    with pytest.raises(AssertionError, match="saw more"):
+        check_attack(Peeking(), Leaky(), Sift(), example_features())
+
+
+def test_attack_that_rummages_in_what_is_kept_on_disk_is_noticed(tmp_path: Path) -> None:
+    from fake_plugins.guess import Guess
+
+    class Rummaging(Guess):
+        def recover(self, view: View, rng: np.random.Generator) -> np.ndarray:
+            (features,) = (entry.path for entry in store.entries() if entry.kind == "features")
+            return unit_rows(tensor_file.load(features, "features")[0]["descriptors"] + np.float32(1e-3))
+
+    class Quantised(Guess):
+        def recover(self, view: View, rng: np.random.Generator) -> np.ndarray:
+            (words,) = (entry.path for entry in store.entries() if entry.kind == "words")
+            found = tensor_file.load(words, "words")[0]["words"]
+            return unit_rows(dictionary.load(Path(small)).words[found])
+
+    small = small_dictionary(tmp_path)
+    for attack in (Rummaging(), Quantised()):
+        with pytest.raises(AssertionError, match="saw more"):
+            check_attack(attack, LDP(dictionary=small), Sift(), example_features())

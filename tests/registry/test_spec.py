@@ -1,0 +1,111 @@
+"""Plugins written as text, and their configuration."""
+
+import math
+from pathlib import Path
+
+import pytest
+
+from bench.api import Asset
+from bench.codebook.examples import small_dictionary
+from bench.codebook.public import Public
+from bench.core.errors import UserError
+from bench.extractors.sift import Sift
+from bench.registry import discovery, spec
+from defenses.affine import Affine
+from defenses.ldp import LDP
+
+
+def test_fields_are_read_by_their_types() -> None:
+    plugin, given = spec.parse("ldp:epsilon=12,subset_size=4", discovery.DEFENSE)
+    assert plugin is LDP
+    assert given == {"epsilon": 12.0, "subset_size": 4}
+    assert isinstance(given["epsilon"], float)
+    assert spec.build(plugin, given) == LDP(epsilon=12.0, subset_size=4)
+
+
+@pytest.mark.parametrize("text", ["ldp", "ldp:", " ldp : "])
+def test_no_fields_means_defaults(text: str) -> None:
+    assert spec.parse(text.strip(), discovery.DEFENSE)[0] is LDP
+    assert spec.read("ldp", discovery.DEFENSE) == LDP()
+
+
+def test_infinity_truth_choices_and_paths() -> None:
+    assert spec.read("ldp:epsilon=inf,subset_size=1", discovery.DEFENSE) == LDP(epsilon=math.inf, subset_size=1)
+    assert spec.read("sift:upright=false", discovery.EXTRACTOR) == Sift(upright=False)
+    assert spec.read("affine:lifting=random", discovery.DEFENSE) == Affine(lifting="random")
+    assert spec.read("ldp:dictionary=/a/b=c.safetensors", discovery.DEFENSE) == LDP(dictionary=Asset("/a/b=c.safetensors"))
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("lpd", "did you mean 'ldp'"),
+        (
+            "ldp:epsilom=1",
+            r"unknown field of ldp 'epsilom'; did you mean 'epsilon'\? There is dictionary, epsilon, memoize, subset_size",
+        ),
+        ("ldp:epsilon=much", "epsilon must be a number"),
+        ("ldp:epsilon=nan", "epsilon must be a number"),
+        ("ldp:epsilon=", "epsilon must be a number"),
+        ("ldp:subset_size=1.5", "subset_size must be a whole number, not '1.5'"),
+        ("ldp:dictionary=", "dictionary must be 'shipped' or the path of a file"),
+        ("affine:lifting=hybird", "lifting must be one of random, adversarial, hybrid"),
+        ("ldp:epsilon", "'epsilon' is not field=value"),
+        ("ldp:epsilon=1,,", "'' is not field=value"),
+        ("ldp:epsilon=1,epsilon=2", "epsilon is given twice"),
+        ("ldp:epsilon=-1", "epsilon"),
+        ("ldp:subset_size=0", "subset_size"),
+        ("affine:dim=3", "even"),
+        ("", "unknown defense ''"),
+    ],
+)
+def test_mistakes_are_explained(text: str, complaint: str) -> None:
+    with pytest.raises(UserError, match=complaint):
+        spec.read(text, discovery.DEFENSE)
+
+
+def test_truth_is_true_or_false() -> None:
+    with pytest.raises(UserError, match="upright must be true or false, not '1'"):
+        spec.read("sift:upright=1", discovery.EXTRACTOR)
+
+
+def test_field_without_default_must_be_given() -> None:
+    with pytest.raises(UserError, match=r"hloc needs path \(a path\): write hloc:path="):
+        spec.read("hloc", discovery.EXTRACTOR)
+
+
+def test_configuration_holds_the_content_of_files(tmp_path: Path) -> None:
+    public, small = Public(), small_dictionary(tmp_path)
+    assert spec.configuration(LDP(epsilon=10, dictionary=small), public) == {
+        "name": "ldp",
+        "epsilon": 10.0,
+        "subset_size": 2,
+        "dictionary": public.dictionary(small).digest,
+        "words": 0,
+        "memoize": False,
+    }
+    renamed = Asset(Path(small).rename(tmp_path / "renamed.safetensors"))
+    assert spec.configuration(LDP(dictionary=renamed), public) == spec.configuration(LDP(epsilon=10, dictionary=small), public)
+
+
+def test_configuration_knows_no_infinity_and_one_way_of_writing_a_number(tmp_path: Path) -> None:
+    small = small_dictionary(tmp_path)
+    assert spec.configuration(LDP(epsilon=math.inf, dictionary=small), Public())["epsilon"] == "inf"
+    assert repr(spec.written(LDP(epsilon=10))["epsilon"]) == "10.0"
+
+
+@pytest.mark.parametrize(("text", "written"), [("21/2", 10.5), ("0.1", 0.1), ("1/3", "1/3"), ("10", 10.0), ("inf", "inf")])
+def test_a_fraction_is_kept(text: str, written: float | str) -> None:
+    """And written so that two configurations which differ are two in the records, too."""
+    assert spec.written(spec.read(f"ldp:epsilon={text}", discovery.DEFENSE))["epsilon"] == written
+    assert spec.written(spec.read("ldp:epsilon=0.3333333333333333", discovery.DEFENSE))["epsilon"] != "1/3"
+
+
+def test_what_is_resolved_elsewhere_stands_in_the_place_of_an_asset() -> None:
+    from attacks.nearest import Nearest
+
+    assert spec.configuration(Nearest(), Public(), {"database": "sha256:00", "inversion": None}) == {
+        "name": "nearest",
+        "database": "sha256:00",
+        "inversion": None,
+    }

@@ -1,0 +1,428 @@
+"""The runner: determinism, resuming, and surviving what goes wrong."""
+
+import copy
+import gc
+import json
+import re
+import shutil
+import weakref
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from fake_plugins.broken import Broken
+from fake_plugins.glimpse import Glimpse
+from fake_plugins.guess import Guess
+from fake_plugins.painter import Painter
+from fakes import FAKES, album, install
+from PIL import Image
+
+from attacks.repeat import Repeat
+from bench.api import Asset, Attack, Defense, Task, View
+from bench.cache import store
+from bench.codebook.examples import small_dictionary
+from bench.core.errors import UserError
+from bench.datasets.gallery import Gallery
+from bench.mechanisms import composition
+from bench.runner import directory, engines
+from bench.runner import plan as runner
+from bench.runner.records import FILE, Record
+from bench.runner.trial import Trials
+from bench.tasks.reconstruction import Reconstruction
+from bench.types import Knowledge
+from defenses.affine import Affine
+from defenses.ldp import LDP
+from defenses.none import Undefended
+
+PAINT = Reconstruction(inverter="painter")
+
+
+@pytest.fixture(autouse=True)
+def _fakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    install(tmp_path / "installed", monkeypatch, FAKES)
+
+
+@pytest.fixture
+def images(tmp_path: Path) -> Path:
+    return album(tmp_path / "album")
+
+
+@pytest.fixture
+def small(tmp_path: Path) -> Asset:
+    return small_dictionary(tmp_path)
+
+
+def run(defenses: list[Defense], attacks: list[Attack], images: Any, task: Task = PAINT, **more: Any) -> list[Record]:
+    return runner.run(defenses, attacks, images, task=task, **more)
+
+
+def written(out: Path) -> list[Record]:
+    return [json.loads(line) for line in (out / FILE).read_text().splitlines()]
+
+
+def judged(records: list[Record]) -> list[Any]:
+    """All of the records but the time that they took."""
+    return [{key: value for key, value in record.items() if key != "seconds"} for record in records]
+
+
+def test_record_has_what_the_schema_says(images: Path, small: Asset) -> None:
+    first, second = run([LDP(epsilon=8, dictionary=small)], [Painter()], images)
+    assert (first["unit"], second["unit"]) == ("0.png", "1.png")
+    assert first["schema"] == 1
+    assert first["status"] == "ok"
+    assert first["reason"] is None
+    assert first["task"] == "reconstruction"
+    assert first["defense"]["epsilon"] == 8.0
+    assert first["defense"]["dictionary"].startswith("sha256:")
+    assert first["attack"] == {"name": "painter", "brightness": 1.0}
+    assert first["dataset"]["name"] == "album"
+    assert first["dataset"]["extractor"]["upright"] is True
+    assert first["metric_settings"]["ssim"]["sigma"] == 1.5
+    count = first["metrics"]["keypoints"]
+    assert count > 0
+    assert first["metrics"]["angle"] is None  # the attack recovered no descriptors
+    assert 0 < first["metrics"]["mae"] < 1
+    privacy = first["privacy"]
+    assert (privacy["guarantee"], privacy["epsilon_descriptor"], privacy["keypoints"], privacy["releases"]) == (
+        "epsilon-ldp",
+        8.0,
+        count,
+        1,
+    )
+    assert privacy["epsilon_image"] == count * 8.0
+    assert privacy["epsilon_image_optimal"] == composition.optimal(8.0, count, privacy["delta"]) < count * 8.0
+    assert privacy["uncovered"] == ["the keypoints' positions", "the number of keypoints"]
+    assert (privacy["seeded"], privacy["private"]) == (True, False)
+    assert privacy["log10_true"] < 0
+    assert first["seconds"] > 0
+    assert first["environment"]["source"].startswith("sha256:")
+    json.dumps(first, allow_nan=False)
+
+
+def test_recovered_descriptors_are_scored_and_painted(images: Path, small: Asset) -> None:
+    record = run([LDP(dictionary=small)], [Guess()], images)[0]
+    assert record["metrics"]["angle"] > 0
+    assert record["metrics"]["ssim"] is not None
+    assert record["attack"] == {"name": "guess", "inversion": {"name": "painter", "brightness": 1.0}}
+
+
+def test_descriptors_are_scored_where_nothing_can_paint_them(images: Path, small: Asset) -> None:
+    from bench.extractors.sift import Sift
+
+    few = Sift(max_keypoints=77)  # no network for it is shipped
+    record = run([LDP(dictionary=small)], [Guess()], images, Reconstruction(), extractor=few)[0]
+    assert record["status"] == "ok"
+    assert record["metrics"]["angle"] > 0
+    assert record["metrics"]["ssim"] is None
+    assert record["notes"][0].startswith("no image: ")
+
+
+def test_same_seed_gives_the_same_metrics_and_another_seed_others(images: Path, small: Asset) -> None:
+    grid = ([LDP(dictionary=small), Affine(lifting="random")], [Painter(), Guess()], images)
+    assert judged(run(*grid)) == judged(run(*grid))
+    assert run(*grid)[0]["metrics"] != run(*grid, seed=1)[0]["metrics"]
+
+
+def test_release_depends_on_neither_attack_order_nor_company(images: Path, small: Asset) -> None:
+    def of(records: list[Record]) -> dict[tuple[str, str, str], Any]:
+        return {(r["defense"]["name"], r["attack"]["name"], r["unit"]): (r["cell_id"] and r["metrics"]) for r in records}
+
+    ldp, affine = LDP(dictionary=small), Affine(lifting="random")
+    whole = of(run([ldp, affine], [Painter(), Guess()], images))
+    assert whole == of(run([affine, ldp], [Guess(), Painter()], images))
+    alone = run([affine], [Guess()], [images / "1.png"])
+    assert [record["metrics"] for record in alone] == [whole["affine", "guess", "1.png"]]
+
+
+def test_releases_that_are_done_with_are_let_go_of_at_once(images: Path, small: Asset) -> None:
+    plan = runner.prepare([LDP(dictionary=small)], [Painter()], images, task=PAINT)
+    trials, (cell,), unit = Trials(plan), plan.cells, plan.units[0]
+    release = weakref.ref(trials.trial(cell, unit).shots[0].release)
+    gc.disable()
+    try:
+        assert release() is not None  # for the next attack on it
+        trials.forget()
+        assert release() is None
+    finally:
+        gc.enable()
+    assert trials.carry_out(cell, unit).record["status"] == "ok"
+
+
+def test_all_attacks_see_the_same_release(images: Path, small: Asset, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[View] = []
+
+    def spoiling(kept: Callable[..., Any]) -> Callable[..., Any]:
+        def spoil(self: Any, view: View, rng: np.random.Generator) -> Any:
+            seen.append(copy.deepcopy(view))
+            estimate = kept(self, view, rng)
+            view.release.keypoints[:] = 0  # what one attack does to its release is nothing to the next
+            return estimate
+
+        return spoil
+
+    monkeypatch.setattr(Painter, "reconstruct", spoiling(Painter.reconstruct))
+    run([LDP(dictionary=small)], [Painter(), Painter(brightness=0.5)], [images / "0.png"])
+    assert np.array_equal(seen[0].release.keypoints, seen[1].release.keypoints)
+    assert np.array_equal(seen[0].release.words, seen[1].release.words)  # type: ignore[attr-defined]
+
+
+def test_view_holds_declared_knowledge_alone(images: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def nosy(self: Any, view: View, rng: np.random.Generator) -> Any:
+        view.know(Knowledge.PUBLIC_DATABASE)
+
+    monkeypatch.setattr(Painter, "reconstruct", nosy)
+    record = run([Undefended()], [Painter()], [images / "0.png"])[0]
+    assert record["status"] == "failed"
+    assert "did not declare PUBLIC_DATABASE" in record["reason"]
+
+
+# ---- pairs that do not apply
+
+
+def test_pair_that_does_not_apply_says_why(images: Path, small: Asset) -> None:
+    records = run([Undefended(), LDP(dictionary=small)], [Guess()], images)
+    assert [(record["unit"], record["status"]) for record in records] == [("*", "n/a"), ("0.png", "ok"), ("1.png", "ok")]
+    assert records[0]["reason"] == "guess attacks WordSets or Subspaces; none releases Descriptors"
+    assert records[0]["metrics"] == {}
+
+
+def test_only_inapplicable_pairs_are_a_mistake(images: Path, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="guess attacks WordSets or Subspaces; none releases Descriptors"):
+        run([Undefended()], [Guess()], images, out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_attack_whose_knowledge_is_not_there_does_not_apply(images: Path, small: Asset, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Painter, "needs", frozenset({Knowledge.MAP}))
+    with pytest.raises(UserError, match="painter needs the server's map; there is none"):
+        run([LDP(dictionary=small)], [Painter()], images)
+    monkeypatch.setattr(Painter, "needs", frozenset({Knowledge.DATABASE}))
+    with pytest.raises(UserError, match="painter needs the database W"):
+        run([LDP(dictionary=small)], [Painter()], images)
+    assert run([Affine(database=small)], [Painter()], images)[0]["status"] == "ok"
+
+
+# ---- what goes wrong
+
+
+def test_bad_photograph_is_a_failed_record_and_the_others_are_done(images: Path, tmp_path: Path) -> None:
+    (images / "0b.jpg").write_bytes(b"\xff\xd8\xff no photograph")
+    Image.new("RGB", (64, 64), "grey").save(images / "flat.png")
+    records = run([Undefended()], [Painter(), Painter(brightness=0.5)], images)
+    assert [record["status"] for record in records] == ["ok", "ok", "failed", "failed", "ok", "ok", "failed", "failed"]
+    assert "cannot be read as an image" in records[2]["reason"]
+    assert "no keypoint" in records[6]["reason"]
+    assert records[2]["privacy"]["epsilon_image"] is None
+    assert records[2]["privacy"]["epsilon_image_optimal"] is None
+
+
+def test_broken_plugin_fails_its_own_cells_and_leaves_a_traceback(images: Path, tmp_path: Path) -> None:
+    records = run([Broken(), Undefended()], [Painter()], images, out=tmp_path / "out")
+    assert [record["status"] for record in records] == ["failed", "ok", "failed", "ok"]
+    assert records[0]["reason"] == "internal error in plugin broken: TypeError: unsupported operand"
+    assert "Traceback" in (tmp_path / "out" / "errors.log").read_text()
+
+
+@pytest.mark.parametrize(
+    ("returned", "complaint"),
+    [
+        (np.zeros((256, 256), np.float32), r"expected float32 \(256, 256, 3\)"),
+        (np.zeros((256, 256, 3)), "returned float64"),
+        (np.full((256, 256, 3), 2, np.float32), "expected 0 to 1"),
+        (np.full((256, 256, 3), np.nan, np.float32), "not finite"),
+        (None, "returned NoneType"),
+    ],
+)
+def test_wrong_image_is_noticed(images: Path, monkeypatch: pytest.MonkeyPatch, returned: Any, complaint: str) -> None:
+    monkeypatch.setattr(Painter, "reconstruct", lambda self, view, rng: returned)
+    record = run([Undefended()], [Painter()], [images / "0.png"])[0]
+    assert record["status"] == "failed"
+    assert re.search(complaint, record["reason"])
+
+
+def test_mistakes_are_found_before_anything_is_written(images: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    tiny = small_dictionary(tmp_path, words=3)
+    broken = Path(shutil.copy(small_dictionary(tmp_path), tmp_path / "broken.safetensors"))
+    broken.write_bytes(broken.read_bytes()[:-1] + b"\x07")
+    mistakes: list[tuple[Callable[[], Any], str]] = [
+        (lambda: run([Undefended()], [Painter()], empty, out=out), "no photograph in it"),
+        (lambda: run([Undefended()], [Painter()], tmp_path / "absent", out=out), "no such folder"),
+        (lambda: run([Undefended()], [Painter()], [], out=out), "no photograph was given"),
+        (lambda: run([], [Painter()], images, out=out), "no defense"),
+        (lambda: run([Undefended()], [], images, out=out), "needs an attack"),
+        (lambda: run([LDP(subset_size=4, dictionary=tiny)], [Painter()], images, out=out), "subset_size|words"),
+        (lambda: run([LDP(dictionary=Asset(tmp_path / "none"))], [Painter()], images, out=out), "no such file"),
+        (lambda: run([LDP(dictionary=Asset(broken))], [Painter()], images, out=out), "checksum"),
+        (lambda: run([Affine(database=tiny)], [Painter()], images, out=out), "affine"),
+        (lambda: run([Affine(dim=200)], [Painter()], images, out=out), "dim must be below"),
+        (
+            lambda: run([Undefended()], [Painter()], images, Reconstruction(inverter="guess"), out=images / "0.png"),
+            "cannot write",
+        ),
+        (lambda: run([Affine(lifting="random")], [Guess()], images, Reconstruction(inverter="guess"), out=out), "inverter"),
+    ]
+    for mistake, complaint in mistakes:
+        with pytest.raises(UserError, match=complaint):
+            mistake()
+    assert not out.exists()
+
+
+def test_memory_and_disk_are_not_the_photographs_fault(images: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def hungry(self: Any, view: View, rng: np.random.Generator) -> Any:
+        raise MemoryError
+
+    monkeypatch.setattr(Painter, "reconstruct", hungry)
+    with pytest.raises(MemoryError):
+        run([Undefended()], [Painter()], images)
+
+
+# ---- resuming
+
+
+def test_finished_run_is_not_done_again(images: Path, small: Asset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    grid: Any = ([Undefended(), LDP(dictionary=small)], [Painter(), Guess()], images)
+    first = run(*grid, out=tmp_path / "out")
+    before = (tmp_path / "out" / FILE).read_bytes()
+
+    def refuse(self: Any, view: View, rng: np.random.Generator) -> Any:
+        raise AssertionError
+
+    monkeypatch.setattr(Painter, "reconstruct", refuse)
+    assert run(*grid, out=tmp_path / "out") == first
+    assert (tmp_path / "out" / FILE).read_bytes() == before
+    for record in first:
+        assert directory.picture(tmp_path / "out", record).is_file() == (record["status"] == "ok")
+
+
+def test_interrupted_run_goes_on_and_ends_as_if_it_had_not_been(images: Path, small: Asset, tmp_path: Path) -> None:
+    grid: Any = ([LDP(dictionary=small)], [Painter(), Guess()], images)
+    whole = run(*grid)
+    plan = runner.prepare(*grid, task=PAINT)
+    started: Iterator[Record] = runner.execute([plan], tmp_path / "out")
+    next(started)
+    started.close()  # type: ignore[attr-defined]
+    file = tmp_path / "out" / FILE
+    file.write_bytes(file.read_bytes() + b'{"schema": 1, "cel')  # and the crash cut off a line
+    resumed = run(*grid, out=tmp_path / "out")
+    assert judged(resumed) == judged(whole)
+    assert len(file.read_bytes().splitlines()) == 4
+
+
+def test_failed_units_are_tried_again(images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as broken:
+        broken.setattr(Painter, "reconstruct", lambda self, view, rng: None)
+        assert {record["status"] for record in run([Undefended()], [Painter()], images, out=tmp_path / "out")} == {"failed"}
+    again = run([Undefended()], [Painter()], images, out=tmp_path / "out")
+    assert {record["status"] for record in again} == {"ok"}
+    assert judged(again) == judged(run([Undefended()], [Painter()], images))
+
+
+def test_changed_photograph_or_setting_is_another_cell(images: Path) -> None:
+    def cell(**more: Any) -> str:
+        return runner.prepare([Undefended()], [Painter()], images, task=PAINT, **more).cells[0].head["cell_id"]
+
+    first = cell()
+    assert cell() == first
+    assert cell(seed=1) != first
+    shutil.copy(images / "0.png", images / "1.png")
+    assert cell() != first
+
+
+def test_damaged_records_stop_the_run_before_it_starts(images: Path, tmp_path: Path) -> None:
+    file = tmp_path / "out" / FILE
+    file.parent.mkdir()
+    file.write_bytes(b"nonsense\n{}\n")
+    with pytest.raises(UserError, match="line 1"):
+        run([Undefended()], [Painter()], images, out=tmp_path / "out")
+    assert file.read_bytes() == b"nonsense\n{}\n"
+
+
+# ---- one device, several releases
+
+
+def test_releases_add_up_and_a_device_that_remembers_repeats_itself(images: Path, small: Asset) -> None:
+    """At ε = 5 a set of 512 words holds the true one with a chance of .37; of 12 sets of a keypoint, it is in most."""
+
+    def of(memoize: bool, releases: int) -> tuple[float, dict[str, Any]]:
+        defense = LDP(epsilon=5, dictionary=small, memoize=memoize)
+        found = run([defense], [Repeat(releases=releases)], images)
+        return float(np.mean([record["metrics"]["l2"] for record in found])), found[0]["privacy"]
+
+    once, spent_once = of(memoize=False, releases=1)
+    often, spent_often = of(memoize=False, releases=12)
+    assert often < once - 0.1  # the attack gains by repetition
+    assert (spent_once["releases"], spent_often["releases"]) == (1, 12)
+    assert spent_often["epsilon_image"] == 12 * spent_once["epsilon_image"]
+    remembered, spent = of(memoize=True, releases=12)
+    assert remembered > often + 0.1  # and by nothing that is repeated word for word
+    assert (spent["guarantee"], spent["releases"]) == ("epsilon-ldp-by-word", 1)
+    assert spent["epsilon_image"] == spent_once["epsilon_image"]
+    assert spent["uncovered"][-1] == "which keypoints share a word"
+
+
+def test_a_device_that_remembers_gives_one_answer_in_all_photographs(images: Path, small: Asset) -> None:
+    """The runner hands all photographs' features to one device."""
+    seen: dict[int, set[tuple[int, ...]]] = {}
+
+    class Watching(LDP):
+        def protect(self, secret: Any, public: Any, rng: np.random.Generator) -> Any:
+            release = super().protect(secret, public, rng)
+            for word, answer in zip(public.nearest_words(small, secret).tolist(), release.words.tolist(), strict=True):
+                seen.setdefault(word, set()).add(tuple(answer))
+            return release
+
+    run([Watching(dictionary=small, memoize=True)], [Painter()], images)
+    assert len(seen) > 20
+    assert all(len(answers) == 1 for answers in seen.values())
+    seen.clear()
+    run([Watching(dictionary=small)], [Painter()], images)
+    assert any(len(answers) > 1 for answers in seen.values())  # the control
+
+
+def test_processes_make_the_same_records(images: Path, small: Asset, tmp_path: Path) -> None:
+    (images / "bad.jpg").write_bytes(b"no photograph")
+    engine = engines.choose(workers=2)
+    plan = runner.prepare([LDP(epsilon=8, dictionary=small), Undefended()], [Painter(), Guess()], images, task=PAINT)
+    alone = runner.in_order([plan], runner.execute([plan], tmp_path / "alone"))
+    together: Iterator[Record] = runner.execute([plan], tmp_path / "together", engine)
+    next(together)
+    next(together)
+    together.close()  # interrupted after a record  # type: ignore[attr-defined]
+    resumed = list(runner.execute([plan], tmp_path / "together", engine))
+    assert judged(runner.in_order([plan], resumed)) == judged(alone)
+    assert sum(record["status"] != "failed" for record in written(tmp_path / "together")) == len(alone) - 3  # none twice
+    pictures = {path.relative_to(tmp_path / "alone"): path.read_bytes() for path in (tmp_path / "alone").rglob("*.png")}
+    assert pictures == {
+        path.relative_to(tmp_path / "together"): path.read_bytes() for path in (tmp_path / "together").rglob("*.png")
+    }
+    assert {record["status"] for record in alone} == {"ok", "n/a", "failed"}
+
+
+def test_selected_keypoints_alone_are_scored_and_painted(images: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[int] = []
+    paint = Painter.reconstruct
+    monkeypatch.setattr(Painter, "reconstruct", lambda self, view, rng: seen.append(len(view.release)) or paint(self, view, rng))
+    found = run([Undefended()], [Glimpse()], images)
+    assert [record["metrics"]["l2"] for record in found] == [0, 0]
+    assert seen == [-(-record["metrics"]["keypoints"] // 2) for record in found]
+
+
+def test_foreground_and_background_are_told_apart_in_a_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(store.VARIABLE, str(tmp_path / "cache"))
+    place = Gallery(views=1, queries=1, night=0, width=160, height=128, detail=0.2, people=4)
+    (record,) = runner.run([Undefended()], [Painter()], task=PAINT, dataset=place)
+    mask = place.scene().queries[0].pixels.foreground()
+    assert mask is not None
+    share = mask.mean()
+    assert 0 < share < 1
+    found = record["metrics"]
+    parts = share * found["mae_foreground"] + (1 - share) * found["mae_background"]
+    assert parts == pytest.approx(found["mae"])
+    assert found["mae_foreground"] != found["mae_background"]
+    assert record["condition"] == "day"
+    assert record["dataset"]["spec"]["name"] == "gallery"
