@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.api import Asset, Defense, DescriptorAttack, Extractor, View, leads_through_no_word, lifted
+from bench.api import Asset, Defense, DescriptorAttack, Extractor, View, explain_no_words, require_subspaces
 from bench.codebook.public import Public
 from bench.core.errors import UserError
 from bench.geometry.nearest_words import unit_rows
@@ -49,11 +49,11 @@ class Clustering(DescriptorAttack):
         if self.others < 0:
             raise UserError(f"clustering: others must be at least 0, got {self.others}")
 
-    def unsuited(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
-        return leads_through_no_word(defense)
+    def explain_incompatible(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
+        return explain_no_words(defense)
 
     def recover(self, view: View, rng: np.random.Generator) -> Floats:
-        release, words = lifted(view)
+        release, words = require_subspaces(view)
         clusters = words + 1
         if self.neighbours < clusters:
             raise UserError(f"clustering: {clusters} clusters need as many neighbours, got {self.neighbours}")

@@ -38,7 +38,7 @@ class Context(DescriptorAttack):
     estimate: Literal["word", "mean"] = "word"
     weights: Asset = Asset("shipped")
 
-    def unsuited(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
+    def explain_incompatible(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
         reason = misfit(self._network().meta, defense, extractor, public)
         return reason and f"no adapted attacker: {self._path().name} was {reason}"
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.api import Defense, DescriptorAttack, Extractor, View, leads_through_no_word, lifted
+from bench.api import Defense, DescriptorAttack, Extractor, View, explain_no_words, require_subspaces
 from bench.codebook.public import Public
 from bench.core.errors import UserError
 from bench.geometry.estimates import estimate
@@ -34,11 +34,11 @@ class Database(DescriptorAttack):
         if not 1 <= self.estimators <= self.neighbours:
             raise UserError(f"database: estimators must be from 1 to neighbours, {self.neighbours}, got {self.estimators}")
 
-    def unsuited(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
-        return leads_through_no_word(defense)
+    def explain_incompatible(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
+        return explain_no_words(defense)
 
     def recover(self, view: View, rng: np.random.Generator) -> Floats:
-        release, adversarial = lifted(view)
+        release, adversarial = require_subspaces(view)
         words = view.know(Knowledge.DATABASE).words  # (K, D)
         if len(words) <= adversarial:
             raise UserError(f"database: {len(words)} words leave none beside the {adversarial} in each subspace")

@@ -33,7 +33,7 @@ class DIA(ImageAttack):
 
     weights: Asset = Asset("shipped")
 
-    def unsuited(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
+    def explain_incompatible(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
         return _choose(self.weights, defense, extractor, public)[1]
 
     def assets(self, defense: Defense, extractor: Extractor, public: Public) -> Mapping[str, str]:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bench.api import Selection, SelectiveAttack, View
-from bench.core.errors import UnitError
+from bench.core.errors import SampleError
 from bench.localization import map_matching
 from bench.types import Descriptors, Knowledge, Subspaces, WordSets
 
@@ -33,7 +33,7 @@ class Inlier(SelectiveAttack):
         server = view.know(Knowledge.MAP)
         matcher = map_matching.default(view.defense)
         if matcher is None:
-            raise UnitError(f"nothing matches {type(view.release).__name__}")
+            raise SampleError(f"nothing matches {type(view.release).__name__}")
         if isinstance(view.release, Subspaces):
             references = np.arange(len(server.place.references))
         else:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.api import Defense, DescriptorAttack, Extractor, View, leads_through_no_word, lifted
+from bench.api import Defense, DescriptorAttack, Extractor, View, explain_no_words, require_subspaces
 from bench.codebook.public import Public
 from bench.core.errors import UserError
 from bench.geometry.database_reconstruction import rebuilt
@@ -44,11 +44,11 @@ class Intersection(DescriptorAttack):
         if self.others < 0:
             raise UserError(f"intersection: others must be at least 0, got {self.others}")
 
-    def unsuited(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
-        return leads_through_no_word(defense)
+    def explain_incompatible(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
+        return explain_no_words(defense)
 
     def recover(self, view: View, rng: np.random.Generator) -> Floats:
-        release, adversarial = lifted(view)
+        release, adversarial = require_subspaces(view)
         shared = company(release, view.know(Knowledge.OTHER_RELEASES)(self.others), adversarial, self.coverage)
         words = rebuilt(meetings_within(shared.subspaces))
         view.notes.append(f"{shared.summary()}; {len(words)} words rebuilt")

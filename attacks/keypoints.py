@@ -29,7 +29,7 @@ class Keypoints(ImageAttack):
 
     weights: Asset = Asset("shipped")
 
-    def unsuited(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
+    def explain_incompatible(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
         network = self._network()
         if network.meta["encoding"] != "positions":
             return "that network reads descriptors; `bench train --encoding positions` makes one that does not"

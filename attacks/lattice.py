@@ -38,7 +38,7 @@ class Lattice(DescriptorAttack):
 
     longest: float = 520.0  # norm of an 8-bit descriptor at most; SIFT scales its own to 512, and rounds
 
-    def unsuited(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
+    def explain_incompatible(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
         if extractor.eight_bit:
             return None
         return f"{self.name()} attacks 8-bit descriptors; {extractor.name()} does not declare that its are"

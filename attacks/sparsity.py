@@ -42,7 +42,7 @@ class Sparsity(DescriptorAttack):
         if self.pivots < 1:
             raise UserError(f"sparsity: pivots must be at least 1, got {self.pivots}")
 
-    def unsuited(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
+    def explain_incompatible(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
         if not extractor.exact_zeros:
             return f"{self.name()} attacks descriptors with exact zeros; {extractor.name()} does not declare that its have any"
         return None

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from bench.codebook.public import Public
-    from bench.images.samples import Collection, Images, Unit
+    from bench.images.samples import Collection, Images, Sample
     from bench.images.scene import Mask, Scene
 
 
@@ -91,11 +91,11 @@ class Defense(Plugin, ABC):
 
     releases: ClassVar[type[Release]]
     # The settings that one trained attacker serves. A network trained for this plugin sees them drawn at random.
-    serves: ClassVar[Mapping[str, Between | OneOf]] = {}
+    supported_settings: ClassVar[Mapping[str, Between | OneOf]] = {}
     # The field that names the dictionary by which descriptors are quantised, if they are, and the field that says how many of
     # its words are used.
-    quantised_by: ClassVar[str | None] = None
-    truncated_by: ClassVar[str | None] = None
+    dictionary_field: ClassVar[str | None] = None
+    word_count_field: ClassVar[str | None] = None
     # Whether the descriptors that it releases are buried in noise.
     noisy: ClassVar[bool] = False
 
@@ -111,13 +111,13 @@ class Defense(Plugin, ABC):
         """How far apart the promise takes two of these descriptors to be: ε-LDP treats all alike. One's own distance is 0."""
         return Fraction(int(one != other))
 
-    def remembers(self) -> bool:
+    def is_memoized(self) -> bool:
         """Whether one device gives equal descriptors equal answers. `rng` then is the device: in the same state at each call."""
         return False
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Lifted:
+class LiftedRelease:
     """A release of subspaces beside what only its owner knows of it."""
 
     release: Subspaces
@@ -139,12 +139,12 @@ class Lifting(Defense):
         """Words of the database that a subspace goes through."""
 
     @abstractmethod
-    def lifted(self, secret: Features, public: Public, rng: np.random.Generator) -> Lifted:
+    def lift(self, secret: Features, public: Public, rng: np.random.Generator) -> LiftedRelease:
         """Make the release of `protect`, and tell which words it goes through."""
 
     @final
     def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> Subspaces:
-        return self.lifted(secret, public, rng).release
+        return self.lift(secret, public, rng).release
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -170,7 +170,7 @@ class View:
         return self.knowledge[what]()
 
 
-def leads_through_no_word(defense: Defense) -> str | None:
+def explain_no_words(defense: Defense) -> str | None:
     """Why the subspaces of that defense go through no word of a database; None if they do."""
     if not isinstance(defense, Lifting):
         return f"{defense.name()} does not say how many words its subspaces go through"
@@ -179,7 +179,7 @@ def leads_through_no_word(defense: Defense) -> str | None:
     return None
 
 
-def lifted(view: View) -> tuple[Subspaces, int]:
+def require_subspaces(view: View) -> tuple[Subspaces, int]:
     """The subspaces that a lifting released, and how many words of its database each goes through.
 
     Raises
@@ -203,7 +203,7 @@ class Attack(Plugin, ABC):
         """Further releases of the same photograph that this attack, as configured, sees: those of REPEATED_RELEASES."""
         return 0
 
-    def unsuited(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
+    def explain_incompatible(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
         """Why this attack, as configured, has nothing adapted to that defense; None if it has."""
         return None
 
@@ -212,19 +212,19 @@ class Attack(Plugin, ABC):
         return {}
 
     @final
-    def inapplicable(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
+    def explain_not_applicable(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
         """Why this attack does not apply to that defense, decided by types and declarations; None if it does."""
         if not issubclass(defense.releases, self.accepts):
             accepted = " or ".join(kind.__name__ for kind in self.accepts)
             return f"{self.name()} attacks {accepted}; {defense.name()} releases {defense.releases.__name__}"
-        return self.unsuited(defense, extractor, public)
+        return self.explain_incompatible(defense, extractor, public)
 
 
 # Carries out a method of an attack, such as `attack.recover`, on what it sees.
-CarryOut = Callable[[Callable[[View, np.random.Generator], Any], View, np.random.Generator], Any]
+Execute = Callable[[Callable[[View, np.random.Generator], Any], View, np.random.Generator], Any]
 
 
-def at_once(method: Callable[[View, np.random.Generator], Any], view: View, rng: np.random.Generator) -> Any:
+def execute_in_process(method: Callable[[View, np.random.Generator], Any], view: View, rng: np.random.Generator) -> Any:
     """Carry it out here and now. `bench.runner.attack_process` does it in another process."""
     return method(view, rng)
 
@@ -333,13 +333,13 @@ class Extractor(Plugin, ABC):
         """The same for the photograph turned by a quarter, counter-clockwise."""
         return None
 
-    def unlimited(self) -> Extractor:
+    def without_limit(self) -> Extractor:
         """The same without its limit on the number of keypoints, if it has one: for dictionaries, which are made of many."""
         return self
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Shot:
+class ProtectedImage:
     """One image of a unit: what only its owner has, and what was released of it."""
 
     pixels: Callable[[], Bytes]  # (H, W, 3); read when it is asked for
@@ -352,8 +352,8 @@ class Shot:
 class Trial:
     """One unit of one cell of the experiment: the truth, what was released of it, and who attacks."""
 
-    unit: Unit
-    shots: tuple[Shot, ...]  # one for each image of the unit
+    sample: Sample
+    images: tuple[ProtectedImage, ...]  # one for each image of the unit
     defense: Defense
     attack: Attack | None  # None where the task judges the release itself
     extractor: Extractor
@@ -362,26 +362,26 @@ class Trial:
     rng: np.random.Generator
     others: Callable[[int], Iterator[Release]]  # the first so many releases of other photographs
     repeats: tuple[Release, ...]  # further releases of the first image's features
-    carry_out: CarryOut = at_once  # where the attack is carried out
-    made_from: Mapping[str, Any] | None = None  # JSON: all that the releases are a function of; None keeps nothing of the trial
+    execute: Execute = execute_in_process  # where the attack is carried out
+    provenance: Mapping[str, Any] | None = None  # JSON: all that the releases are a function of; None keeps nothing of the trial
 
     @property
     def secret(self) -> Features:
         """Of the unit's first image, for most the only one."""
-        return self.shots[0].secret
+        return self.images[0].secret
 
     @property
     def release(self) -> Release:
         """Of the unit's first image, for most the only one."""
-        return self.shots[0].release
+        return self.images[0].release
 
     def pixels(self) -> Bytes:
         """(H, W, 3) of the unit's first image, for most the only one."""
-        return self.shots[0].pixels()
+        return self.images[0].pixels()
 
     def released(self, release: Release) -> Trial:
         """The same trial, had that been released of the unit's first image."""
-        return replace(self, shots=(replace(self.shots[0], release=release), *self.shots[1:]))
+        return replace(self, images=(replace(self.images[0], release=release), *self.images[1:]))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -392,18 +392,18 @@ class Outcome:
     image: Floats | None = None  # (H, W, 3) in [0, 1], where one was made
     estimates: Mapping[str, Any] = field(default_factory=dict)  # what was found that is no measure of it, such as a pose; JSON
     notes: tuple[str, ...] = ()
-    spared: float = 0.0  # seconds that it would have taken longer, had nothing been kept
+    saved_seconds: float = 0.0  # seconds that it would have taken longer, had nothing been kept
 
 
 class Task(Plugin, ABC):
     """What a release is judged by. The runner plans, resumes and records; a task does one trial at a time."""
 
-    attacked: ClassVar[bool]  # whether it judges what an attack makes of the release, and not the release itself
-    places: ClassVar[bool] = False  # whether it is about a place, even if none is named
-    mapped: ClassVar[bool] = False  # whether it asks for the place's map
+    judges_attacks: ClassVar[bool]  # whether it judges what an attack makes of the release, and not the release itself
+    needs_scene: ClassVar[bool] = False  # whether it is about a place, even if none is named
+    needs_map: ClassVar[bool] = False  # whether it asks for the place's map
 
     @abstractmethod
-    def collection(self, images: Images, dataset: Dataset | None) -> Collection:
+    def collect(self, images: Images, dataset: Dataset | None) -> Collection:
         """What there is to judge, given photographs or a place; the built-in ones where neither is given.
 
         Raises
@@ -413,11 +413,11 @@ class Task(Plugin, ABC):
         """
 
     @abstractmethod
-    def inapplicable(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> str | None:
+    def explain_not_applicable(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> str | None:
         """Why there is nothing to judge in that pair; None if there is."""
 
     @abstractmethod
-    def resolved(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> Mapping[str, Any]:
+    def resolve(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> Mapping[str, Any]:
         """What the attack would use of other plugins and files, with digests: merged into its recorded configuration.
 
         Raises
@@ -427,7 +427,7 @@ class Task(Plugin, ABC):
         """
 
     @abstractmethod
-    def judge(self, trial: Trial) -> Outcome:
+    def evaluate(self, trial: Trial) -> Outcome:
         """Carry out one trial.
 
         Raises

@@ -26,7 +26,7 @@ from bench.api import (
     ImageAttack,
     Metric,
     Outcome,
-    Shot,
+    ProtectedImage,
     Task,
     Trial,
 )
@@ -37,19 +37,19 @@ from bench.codebook.public import Public
 from bench.formats import tensor_file
 from bench.geometry.nearest_words import unit_rows
 from bench.images import photographs
-from bench.images.samples import Unit
+from bench.images.samples import Sample
 from bench.tasks.reconstruction import Reconstruction, view
 from bench.types import Descriptors, Features, Floats, Indices, Release, Subspaces, WordSets
 
 TOLERANCE = 1e-5  # of norms and angles in float32
 
 
-NO_UNIT = Unit(name="made up", images=())
+NO_SAMPLE = Sample(name="made up", images=())
 
 
-def shot(secret: Features, release: Release) -> Shot:
+def shot(secret: Features, release: Release) -> ProtectedImage:
     """Features and their release, of a black photograph."""
-    return Shot(pixels=lambda: np.zeros((*secret.size[::-1], 3), np.uint8), secret=secret, release=release)
+    return ProtectedImage(pixels=lambda: np.zeros((*secret.size[::-1], 3), np.uint8), secret=secret, release=release)
 
 
 def check_defense(defense: Defense, public: Public, secret: Features) -> None:
@@ -74,9 +74,9 @@ def check_defense(defense: Defense, public: Public, secret: Features) -> None:
 def check_applicability(attack: Attack, defense: Defense, extractor: Extractor, public: Public) -> bool:
     """Whether an attack applies is stated, twice alike, and with a reason if not. Returns it."""
     task = Reconstruction()
-    reason = task.inapplicable(defense, attack, extractor, public)
+    reason = task.explain_not_applicable(defense, attack, extractor, public)
     assert reason is None or reason.strip(), "an attack that does not apply says why"
-    assert reason == task.inapplicable(defense, attack, extractor, public)
+    assert reason == task.explain_not_applicable(defense, attack, extractor, public)
     return reason is None
 
 
@@ -105,8 +105,8 @@ def _check_attack(attack: Attack, defense: Defense, extractor: Extractor, secret
         return (defense.protect(features, Public(), np.random.default_rng(4)) for features in strangers[:count])
 
     trial = Trial(
-        unit=NO_UNIT,
-        shots=(shot(mine, defense.protect(mine, public, np.random.default_rng(1))),),
+        sample=NO_SAMPLE,
+        images=(shot(mine, defense.protect(mine, public, np.random.default_rng(1))),),
         defense=defense,
         attack=attack,
         extractor=extractor,
@@ -179,7 +179,7 @@ def overwrite(file: Path, kind: str) -> None:
 
 def check_task(task: Task, defense: Defense, extractor: Extractor, secret: Features) -> None:
     """A task without an attack gives finite numbers, each time the same, and changes nothing."""
-    assert not task.attacked, "what an attack recovers is judged by reconstruction"
+    assert not task.judges_attacks, "what an attack recovers is judged by reconstruction"
     public, before = Public(), copy.deepcopy(secret)
     release = defense.protect(secret, public, np.random.default_rng(1))
     released = copy.deepcopy(release)
@@ -189,8 +189,8 @@ def check_task(task: Task, defense: Defense, extractor: Extractor, secret: Featu
 
     def judged() -> Outcome:
         trial = Trial(
-            unit=NO_UNIT,
-            shots=(shot(secret, release),),
+            sample=NO_SAMPLE,
+            images=(shot(secret, release),),
             defense=defense,
             attack=None,
             extractor=extractor,
@@ -200,7 +200,7 @@ def check_task(task: Task, defense: Defense, extractor: Extractor, secret: Featu
             others=others,
             repeats=(),
         )
-        return task.judge(trial)
+        return task.evaluate(trial)
 
     first = judged()
     assert first.metrics, "judged nothing"

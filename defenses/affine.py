@@ -13,9 +13,9 @@ from typing import ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.api import Asset, Between, Lifted, Lifting, OneOf, Privacy
+from bench.api import Asset, Between, LiftedRelease, Lifting, OneOf, Privacy
 from bench.codebook.public import Public
-from bench.core.errors import UnitError, UserError
+from bench.core.errors import SampleError, UserError
 from bench.geometry.nearest_words import unit_rows
 from bench.mechanisms.subset import draw_distinct
 from bench.types import Bytes, Features, Floats, Indices, Subspaces
@@ -34,7 +34,7 @@ class Affine(Lifting):
     The adversarial words of a photograph come from one sub-database, drawn for it; those of a keypoint are distinct.
     """
 
-    serves: ClassVar[Mapping[str, Between | OneOf]] = {"dim": OneOf((2, 4, 6, 8, 10, 12, 14, 16))}
+    supported_settings: ClassVar[Mapping[str, Between | OneOf]] = {"dim": OneOf((2, 4, 6, 8, 10, 12, 14, 16))}
 
     lifting: Literal["random", "adversarial", "hybrid"] = "hybrid"  # none, all or half of the directions lead to words
     dim: int = 4  # of the subspace
@@ -55,7 +55,7 @@ class Affine(Lifting):
     def adversarial(self) -> int:
         return {"random": 0, "hybrid": self.dim // 2, "adversarial": self.dim}[self.lifting]
 
-    def lifted(self, secret: Features, public: Public, rng: np.random.Generator) -> Lifted:
+    def lift(self, secret: Features, public: Public, rng: np.random.Generator) -> LiftedRelease:
         length = secret.descriptors.shape[1]
         if self.dim >= length:
             raise UserError(f"affine: dim must be below the descriptors' length, {length}, got {self.dim}")
@@ -64,7 +64,7 @@ class Affine(Lifting):
         span, drawn = lift(d, words, self.adversarial, self.dim, rng)  # (N, dim, D), (N, adversarial)
         origins, bases = reparameterise(d, span, rng)
         release = Subspaces(keypoints=secret.keypoints.copy(), size=secret.size, origins=origins, bases=bases)
-        return Lifted(release=release, words=start + drawn)
+        return LiftedRelease(release=release, words=start + drawn)
 
     def privacy(self, public: Public) -> Privacy:
         return Privacy("none")
@@ -112,7 +112,7 @@ def lift(d: Doubles, words: Bytes, adversarial: int, dim: int, rng: np.random.Ge
         waiting = waiting[(gained <= DEGENERATE * lengths).any(axis=1)]
         if len(waiting) == 0:
             return span.transpose(0, 2, 1), drawn
-    raise UnitError(f"affine: a descriptor lies in the span of every draw of {adversarial} words of its sub-database")
+    raise SampleError(f"affine: a descriptor lies in the span of every draw of {adversarial} words of its sub-database")
 
 
 def reparameterise(d: Doubles, span: Doubles, rng: np.random.Generator) -> tuple[Floats, Floats]:

@@ -41,9 +41,9 @@ class Exponential(Defense):
     """Releases words that are the likelier, the greater their cosine with the descriptor's nearest word."""
 
     releases = WordSets
-    serves: ClassVar[Mapping[str, Between | OneOf]] = {"epsilon": Between(8.0, 32.0), "words": OneOf((0, 128_000))}
-    quantised_by: ClassVar[str | None] = "dictionary"
-    truncated_by: ClassVar[str | None] = "words"
+    supported_settings: ClassVar[Mapping[str, Between | OneOf]] = {"epsilon": Between(8.0, 32.0), "words": OneOf((0, 128_000))}
+    dictionary_field: ClassVar[str | None] = "dictionary"
+    word_count_field: ClassVar[str | None] = "words"
 
     epsilon: float = 10.0  # nats, per descriptor
     subset_size: int = 1  # words released per keypoint, with epsilon / subset_size each

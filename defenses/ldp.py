@@ -31,13 +31,13 @@ class LDP(Defense):
     """
 
     releases = WordSets
-    serves: ClassVar[Mapping[str, Between | OneOf]] = {
+    supported_settings: ClassVar[Mapping[str, Between | OneOf]] = {
         "epsilon": Between(8.0, 16.0),
         "subset_size": OneOf((1, 2, 3, 4)),
         "words": OneOf((0, 128_000)),
     }
-    quantised_by: ClassVar[str | None] = "dictionary"
-    truncated_by: ClassVar[str | None] = "words"
+    dictionary_field: ClassVar[str | None] = "dictionary"
+    word_count_field: ClassVar[str | None] = "words"
 
     epsilon: float = 10.0  # nats, per descriptor
     subset_size: int = 2  # words released per keypoint
@@ -70,7 +70,7 @@ class LDP(Defense):
             return Privacy("none", log10_true=log10_true)
         return Privacy("epsilon-ldp-by-word" if self.memoize else "epsilon-ldp", self.epsilon, log10_true)
 
-    def remembers(self) -> bool:
+    def is_memoized(self) -> bool:
         return self.memoize
 
     def _known(self, public: Public) -> Dictionary:

@@ -47,9 +47,9 @@ class MetricLDP(Defense):
     """Releases a word that is the likelier, the nearer it is to the descriptor's nearest word; a promise by distance."""
 
     releases = WordSets
-    serves: ClassVar[Mapping[str, Between | OneOf]] = {"epsilon": Between(10.0, 80.0), "words": OneOf((0, 128_000))}
-    quantised_by: ClassVar[str | None] = "dictionary"
-    truncated_by: ClassVar[str | None] = "words"
+    supported_settings: ClassVar[Mapping[str, Between | OneOf]] = {"epsilon": Between(10.0, 80.0), "words": OneOf((0, 128_000))}
+    dictionary_field: ClassVar[str | None] = "dictionary"
+    word_count_field: ClassVar[str | None] = "words"
 
     epsilon: float = 16.0  # nats per unit of distance between unit descriptors
     steps: int = 16  # in a unit of distance

@@ -43,14 +43,14 @@ class Plateau(Defense):
     """Releases a random set of words, likelier if it holds the descriptor's nearest word or one near to that."""
 
     releases = WordSets
-    serves: ClassVar[Mapping[str, Between | OneOf]] = {
+    supported_settings: ClassVar[Mapping[str, Between | OneOf]] = {
         "epsilon": Between(8.0, 16.0),
         "subset_size": OneOf((1, 2, 3, 4)),
         "near": OneOf((2, 4, 8)),
         "words": OneOf((0, 128_000)),
     }
-    quantised_by: ClassVar[str | None] = "dictionary"
-    truncated_by: ClassVar[str | None] = "words"
+    dictionary_field: ClassVar[str | None] = "dictionary"
+    word_count_field: ClassVar[str | None] = "words"
 
     epsilon: float = 10.0  # nats, per descriptor
     subset_size: int = 2  # words released per keypoint

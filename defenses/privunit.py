@@ -55,7 +55,7 @@ class PrivUnit(Defense):
     """Releases a unit vector, likelier in a cap around the descriptor."""
 
     releases = Descriptors
-    serves: ClassVar[Mapping[str, Between | OneOf]] = {"epsilon": Between(4.0, 32.0)}
+    supported_settings: ClassVar[Mapping[str, Between | OneOf]] = {"epsilon": Between(4.0, 32.0)}
     noisy: ClassVar[bool] = True
 
     epsilon: float = 10.0  # nats, per descriptor

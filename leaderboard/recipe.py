@@ -72,8 +72,8 @@ def _option(name: str, text: str) -> str:
 def _made_there(lookup: Lookup, head: Record) -> str | None:
     """The field of the defense that is filled in with a dictionary of the place, if the task is about one."""
     task, defense = lookup(discovery.TASK, head["task"]), lookup(discovery.DEFENSE, head["defense"]["name"])
-    about_places = task is not None and issubclass(task, Task) and task.places
-    return defense.quantised_by if about_places and defense is not None and issubclass(defense, Defense) else None
+    about_places = task is not None and issubclass(task, Task) and task.needs_scene
+    return defense.dictionary_field if about_places and defense is not None and issubclass(defense, Defense) else None
 
 
 def _metrics(lookup: Lookup, settings: Mapping[str, Mapping[str, Any]], needs: dict[str, None]) -> Iterator[str]:

@@ -7,15 +7,15 @@ from pathlib import Path
 
 from PIL import Image
 
-from bench.core.errors import UnitError
+from bench.core.errors import SampleError
 from bench.images import samples
-from bench.images.samples import Unit
-from bench.runner.directory import picture
+from bench.images.samples import Sample
+from bench.runner.directory import reconstruction_path
 from bench.runner.records import Record
 from leaderboard import figures, tables
 
 
-def write(records: Sequence[Record], judged: Sequence[Unit], out: Path) -> None:
+def write(records: Sequence[Record], judged: Sequence[Sample], out: Path) -> None:
     """Write the report of `records` into the folder `out`, which keeps their reconstructions and then the photographs, too.
 
     Raises
@@ -28,7 +28,7 @@ def write(records: Sequence[Record], judged: Sequence[Unit], out: Path) -> None:
     (out / "report.csv").write_text(tables.to_csv(found), encoding="utf-8", errors="replace")
     for unit in judged:
         of_it = [record for record in records if record["unit"] == unit.name]
-        if any(picture(out, record).is_file() for record in of_it):
+        if any(reconstruction_path(out, record).is_file() for record in of_it):
             _figure(unit, of_it, out)
 
 
@@ -38,15 +38,15 @@ def photograph(out: Path, record: Record) -> Path:
     return out / "photographs" / content / f"{record['unit']}.png"
 
 
-def _figure(unit: Unit, records: Sequence[Record], out: Path) -> None:
+def _figure(unit: Sample, records: Sequence[Record], out: Path) -> None:
     try:
-        original = samples.read(unit.images[0])[0]
-    except UnitError:
+        original = samples.read_pixels(unit.images[0])[0]
+    except SampleError:
         return  # it has gone since
     kept, path = photograph(out, records[0]), out / "figures" / f"{unit.name}.png"
     for folder in (kept.parent, path.parent):
         folder.mkdir(parents=True, exist_ok=True)
     Image.fromarray(original).save(kept)
-    shown = figures.panels(original, records, [picture(out, record) for record in records])
+    shown = figures.panels(original, records, [reconstruction_path(out, record) for record in records])
     # Without the software's version, the same run gives the same file.
     figures.draw(shown, f"{unit.name}. {tables.SEEDED}").savefig(path, metadata={"Software": None})

@@ -18,7 +18,7 @@ import numpy as np
 
 from bench.api import Asset, Plugin, Task
 from bench.codebook.public import ASSETS, REFERENCES, SHIPPED
-from bench.core.errors import UnitError, UserError
+from bench.core.errors import SampleError, UserError
 from bench.core.progress import Progress
 from bench.images.photographs import folder
 from bench.images.samples import Images
@@ -26,9 +26,9 @@ from bench.registry import discovery, fields, spec
 from bench.registry.discovery import Kind
 from bench.runner import plan as runner
 from bench.runner import records, trial
-from bench.runner.attack_process import isolated
-from bench.runner.plan import Asked, Cell, Plan
-from bench.runner.records import EVERY_UNIT, Record
+from bench.runner.attack_process import execute_in_attack_process
+from bench.runner.plan import Experiment, Plan, RunConfiguration
+from bench.runner.records import EVERY_SAMPLE, Record
 from bench.runner.trial import Trials
 from leaderboard.regression import ABSOLUTE_FLOOR, RELATIVE_FLOOR
 
@@ -132,7 +132,7 @@ def _inconsistent(record: Record) -> Iterator[str]:
     """Hashes that are not those of what they stand for, and metrics out of their range."""
     task = {"name": record["task"], **record["task_settings"]}
     configured = (task, record["defense"], record["attack"], record["dataset"], record["seed"], record["metric_settings"])
-    if (right := records.cell_id(*configured)) != record["cell_id"]:
+    if (right := records.experiment_id(*configured)) != record["cell_id"]:
         yield f"cell_id: is {record['cell_id']}, but that of this configuration is {right}"
     if (right := records.run_hash(record["cell_id"], record["environment"])) != record["run_hash"]:
         yield f"run_hash: is {record['run_hash']}, but that of this cell and environment is {right}"
@@ -205,7 +205,7 @@ class _Here:
         return spec.build(plugin, given)
 
 
-Planned = tuple[int, Cell, list[Line], Plan]
+Planned = tuple[int, Experiment, list[Line], Plan]
 
 
 def _plans(lines: Sequence[Line], here: _Here) -> Iterator[list[Planned | Fault]]:
@@ -217,19 +217,19 @@ def _plans(lines: Sequence[Line], here: _Here) -> Iterator[list[Planned | Fault]
         first = members[0]
         try:
             plan = runner.planned(_asked(first.record, here))
-            yield [(first.number, plan.cells[0], members, plan)]
-        except (UserError, UnitError) as error:
+            yield [(first.number, plan.experiments[0], members, plan)]
+        except (UserError, SampleError) as error:
             yield [Fault(first.number, " ".join(str(error).split()))]
 
 
-def _asked(record: Record, here: _Here) -> Asked:
+def _asked(record: Record, here: _Here) -> RunConfiguration:
     task: Task = here.plugin(discovery.TASK, {"name": record["task"], **record["task_settings"]})
     dataset = record["dataset"]["spec"]
     defense = here.plugin(discovery.DEFENSE, record["defense"])
-    quantised = defense.quantised_by
+    quantised = defense.dictionary_field
     if dataset is not None and quantised is not None and record["defense"][quantised] not in here.assets:
         defense = dataclasses.replace(defense, **{quantised: Asset(REFERENCES)})  # type: ignore[type-var]
-    return Asked(
+    return RunConfiguration(
         pairs=((defense, None if record["attack"] is None else here.plugin(discovery.ATTACK, record["attack"])),),
         images=here.photographs(record),
         task=task,
@@ -239,19 +239,19 @@ def _asked(record: Record, here: _Here) -> Asked:
     )
 
 
-def _impossible(cell: Cell, members: Sequence[Line], plan: Plan) -> Iterator[Fault]:
+def _impossible(cell: Experiment, members: Sequence[Line], plan: Plan) -> Iterator[Fault]:
     """What cannot be so in a cell: other inputs than those here, a pair that does not apply, other promises, units left out."""
     first = members[0]
-    if cell.head["cell_id"] != first.record["cell_id"]:
-        yield Fault(first.number, f"another cell than can be made here: {_difference(first.record, cell.head)}")
+    if cell.metadata["cell_id"] != first.record["cell_id"]:
+        yield Fault(first.number, f"another cell than can be made here: {_difference(first.record, cell.metadata)}")
         return
-    names = {unit.name for unit in plan.units}
+    names = {unit.name for unit in plan.samples}
     for line in members:
         record = line.record
         if (cell.reason is None) == (record["status"] == "n/a"):
             told = f"does not apply ({cell.reason})" if cell.reason else "applies, but the record says n/a"
             yield Fault(line.number, f"status: the pair {told}")
-        if record["unit"] not in (names if cell.reason is None else {EVERY_UNIT}):
+        if record["unit"] not in (names if cell.reason is None else {EVERY_SAMPLE}):
             yield Fault(line.number, f"unit: the dataset has no {record['unit']!r}")
         right = trial.privacy(cell, record["privacy"]["keypoints"])
         for name, value in right.items():
@@ -276,9 +276,9 @@ def _difference(record: Record, here: Record) -> str:
 # ---- a sample, made again
 
 
-def _again(done: Sequence[tuple[Plan, Cell, Line]], sample: int, seed: int) -> Iterator[Fault]:
+def _again(done: Sequence[tuple[Plan, Experiment, Line]], sample: int, seed: int) -> Iterator[Fault]:
     """What of the sample comes out differently where the attack's process does not hold the secret."""
-    usable = [one for one in done if one[1].head["cell_id"] == one[2].record["cell_id"]]
+    usable = [one for one in done if one[1].metadata["cell_id"] == one[2].record["cell_id"]]
     chosen = np.sort(np.random.default_rng(seed).permutation(len(usable))[:sample])
     with Progress("made again", len(chosen)) as progress:
         for plan, cell, line in (usable[place] for place in chosen):
@@ -286,10 +286,10 @@ def _again(done: Sequence[tuple[Plan, Cell, Line]], sample: int, seed: int) -> I
             progress.advance(note=line.record["unit"])
 
 
-def _made_again(plan: Plan, cell: Cell, name: str) -> Record | None:
-    unit = next((unit for unit in plan.units if unit.name == name), None)
-    apart = dataclasses.replace(plan, carry_out=isolated)
-    return None if unit is None or cell.reason else Trials(apart).carry_out(cell, unit).record
+def _made_again(plan: Plan, cell: Experiment, name: str) -> Record | None:
+    unit = next((unit for unit in plan.samples if unit.name == name), None)
+    apart = dataclasses.replace(plan, execute=execute_in_attack_process)
+    return None if unit is None or cell.reason else Trials(apart).execute(cell, unit).record
 
 
 def _compared(line: Line, again: Record | None) -> Iterator[Fault]:

@@ -24,12 +24,12 @@ import numpy as np
 
 from bench.api import Task
 from bench.cache import provenance, store
-from bench.core.errors import UnitError
+from bench.core.errors import SampleError
 from bench.datasets import gallery
 from bench.images import photographs
 from bench.registry import discovery, spec
 from bench.runner import plan as runner
-from bench.runner.plan import Asked
+from bench.runner.plan import RunConfiguration
 from bench.runner.trial import Trials
 from bench.types import Release
 
@@ -97,8 +97,8 @@ def measured(case: Case) -> Iterator[dict[str, Any]]:
     """One line for each pair on each sample."""
     plan = planned(case)
     trials = Trials(plan)
-    for unit in plan.units[: case.samples]:
-        for cell in plan.cells:
+    for unit in plan.samples[: case.samples]:
+        for cell in plan.experiments:
             line: dict[str, Any] = {
                 "case": [case.task, case.extractor, case.dataset],
                 "defense": spec.written(cell.defense),
@@ -110,12 +110,12 @@ def measured(case: Case) -> Iterator[dict[str, Any]]:
                 continue
             try:
                 trial = trials.trial(cell, unit)
-                outcome = plan.task.judge(trial)
-            except UnitError as error:
+                outcome = plan.task.evaluate(trial)
+            except SampleError as error:
                 yield line | {"applies": True, "failed": type(error).__name__}
                 continue
             others = list(trial.others(2)) if cell.attack is not None else []
-            releases = [*(shot.release for shot in trial.shots), *trial.repeats, *others]
+            releases = [*(shot.release for shot in trial.images), *trial.repeats, *others]
             image = None if outcome.image is None else [float(outcome.image.mean()), float(outcome.image.std())]
             yield line | {
                 "applies": True,
@@ -131,7 +131,7 @@ def planned(case: Case) -> Any:
     attacks = [None if text is None else spec.read(text, discovery.ATTACK) for text in case.attacks]
     pairs = [(spec.read(text, discovery.DEFENSE), attack) for text in case.defenses for attack in attacks]
     return runner.planned(
-        Asked(
+        RunConfiguration(
             pairs=tuple(pairs),
             images=sources or None,
             task=task,

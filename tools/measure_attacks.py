@@ -33,7 +33,7 @@ from bench.extractors.sift import Sift
 from bench.geometry.lattice import unit_integer_points
 from bench.images import photographs
 from bench.registry import discovery, spec
-from bench.runner.other_releases import Population
+from bench.runner.other_releases import OtherReleases
 from bench.runner.records import Record
 from bench.types import Features, Knowledge, Subspaces
 from defenses.affine import Affine
@@ -244,7 +244,7 @@ def seconds(attack: Attack, seen: View) -> float:
 # ---- views
 
 
-def view(defense: Defense, secret: Features, population: Population | None = None, photograph: str = "") -> View:
+def view(defense: Defense, secret: Features, population: OtherReleases | None = None, photograph: str = "") -> View:
     """All knowledge that there is, whatever an attack asks for."""
     public = PUBLIC
     knowledge = {
@@ -257,9 +257,9 @@ def view(defense: Defense, secret: Features, population: Population | None = Non
     return View(release=release, defense=defense, extractor=Sift(), knowledge=knowledge)
 
 
-def others(defense: Affine) -> Population:
+def others(defense: Affine) -> OtherReleases:
     """Releases of other photographs, as many as an attack asks for at most, made already."""
-    population = Population(photographs.builtin(), Sift(), defense, PUBLIC, functools.partial(drawn, defense.dim))
+    population = OtherReleases(photographs.builtin(), Sift(), defense, PUBLIC, functools.partial(drawn, defense.dim))
     for source in photographs.builtin():
         for _ in population.without(source.name)(800):
             pass

@@ -24,7 +24,7 @@ from bench.inversion.train import check_quantisation
 from bench.inversion.weights import describe
 from defenses.ldp import LDP
 
-SERVED = {field: LDP.serves[field] for field in ("epsilon", "subset_size")}
+SERVED = {field: LDP.supported_settings[field] for field in ("epsilon", "subset_size")}
 TRIED = [LDP(epsilon=epsilon, subset_size=size) for epsilon, size in ((8, 2), (10, 1), (10, 2), (10, 4), (12, 2), (16, 2))]
 
 

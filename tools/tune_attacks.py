@@ -24,7 +24,7 @@ import numpy as np
 from attacks.clustering import Clustering, candidates, chosen
 from attacks.database import Database
 from attacks.intersection import Intersection, described
-from bench.api import DescriptorAttack, View, lifted
+from bench.api import DescriptorAttack, View, require_subspaces
 from bench.codebook.public import Public
 from bench.core.errors import UserError
 from bench.core.progress import Progress
@@ -37,7 +37,7 @@ from bench.geometry.subspaces import nearest_to_subspaces
 from bench.images import photographs
 from bench.images.photographs import Source
 from bench.registry import discovery, spec
-from bench.runner.other_releases import Population
+from bench.runner.other_releases import OtherReleases
 from bench.tasks.reconstruction import offered
 from bench.types import Floats, Knowledge
 from metrics.angle import Angle
@@ -80,7 +80,7 @@ class Tuning:
 
 def recover_by_database(seen: View, settings: Sequence[Database]) -> Iterator[Tried]:
     """One search for all: fewer neighbours are the first of many."""
-    release, adversarial = lifted(seen)
+    release, adversarial = require_subspaces(seen)
     words = seen.know(Knowledge.DATABASE).words
     most = max(attack.neighbours for attack in settings)
     found, distances = nearest_to_subspaces(release, words, adversarial + most)
@@ -91,7 +91,7 @@ def recover_by_database(seen: View, settings: Sequence[Database]) -> Iterator[Tr
 
 def recover_by_clustering(seen: View, settings: Sequence[Clustering]) -> Iterator[Tried]:
     """One search, one clustering for each |V|, and one company for each c."""
-    release, adversarial = lifted(seen)
+    release, adversarial = require_subspaces(seen)
     z = seen.know(Knowledge.PUBLIC_DATABASE).words
     found, distances = nearest_to_subspaces(release, z, max(attack.neighbours for attack in settings))
 
@@ -107,7 +107,7 @@ def recover_by_clustering(seen: View, settings: Sequence[Clustering]) -> Iterato
 
 def recover_by_intersection(seen: View, settings: Sequence[Intersection]) -> Iterator[Tried]:
     """One company and one rebuilt database for each c."""
-    release, adversarial = lifted(seen)
+    release, adversarial = require_subspaces(seen)
     shared = companies(seen)
 
     @functools.cache
@@ -121,7 +121,7 @@ def recover_by_intersection(seen: View, settings: Sequence[Intersection]) -> Ite
 
 def companies(seen: View) -> Callable[[int, float], Company]:
     """From c and the share that is enough to the company of the release, each found once."""
-    release, adversarial = lifted(seen)
+    release, adversarial = require_subspaces(seen)
     others = seen.know(Knowledge.OTHER_RELEASES)
     return functools.cache(lambda count, enough: company(release, others(count), adversarial, enough))
 
@@ -170,7 +170,8 @@ def measure(tuning: Tuning, sources: Sequence[Source]) -> np.ndarray:
     public, extractor = Public(), Sift()
     defenses = [spec.read(point, discovery.DEFENSE) for point in POINTS]
     populations = [
-        Population(sources, extractor, defense, public, functools.partial(drawn, point)) for point, defense in enumerate(defenses)
+        OtherReleases(sources, extractor, defense, public, functools.partial(drawn, point))
+        for point, defense in enumerate(defenses)
     ]
     settings = list(tuning.settings.values())
     chosen_sources = sources[: tuning.photographs]

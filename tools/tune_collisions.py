@@ -27,7 +27,7 @@ from bench.geometry.nearest_words import unit_rows
 from bench.geometry.shared_sub_database import company, nearest_that_meet
 from bench.images import photographs
 from bench.images.photographs import Source
-from bench.runner.other_releases import Population
+from bench.runner.other_releases import OtherReleases
 from bench.tasks.collisions import no_collision
 from bench.types import Knowledge
 from defenses.affine import Affine
@@ -64,7 +64,7 @@ def measured(dim: int, sources: list[Source], count: int, progress: Progress) ->
     """Of each of the first photographs: where the attack succeeds, (N,), and what `no_collision` is computed from, (N, 1 + a)."""
     public, extractor, defense, attack = Public(), Sift(), Affine(dim=dim), Clustering()
     words = unit_rows(public.dictionary(defense.database).words)
-    population = Population(sources, extractor, defense, public, partial(drawn, dim))
+    population = OtherReleases(sources, extractor, defense, public, partial(drawn, dim))
     for number, source in enumerate(sources[:count]):
         secret = extractor.extract(photographs.read(source.path).pixels)
         lifted = defense.lifted(secret, public, np.random.default_rng([SEED, dim, number]))

@@ -116,14 +116,14 @@ def audit(defense: Defense, words: int | None, trials: int, seed: int, folder: P
     tried = secrets.take(np.array([0, len(secrets) - 1]))
     apart = float(defense.distance(tried, public, 0, 1))
     findings = tuple(finding.per(apart) for finding in _findings(defense, tried, public, trials, seed))
-    notes = [LINKED] if defense.remembers() else []
+    notes = [LINKED] if defense.is_memoized() else []
     if alike := [finding.family for finding in findings if finding.alike]:
         notes.append(ALIKE.format(", ".join(alike)))
     enumeration = None
     try:
         if words is None or words > ENUMERATED:
             raise NotEnumerableError(f"that takes a dictionary of at most {ENUMERATED} words")
-        if defense.remembers():
+        if defense.is_memoized():
             raise NotEnumerableError("a device that remembers draws its answers to all words at once")
         enumeration = enumerated(defense, secrets, public, claimed)
     except NotEnumerableError as reason:
@@ -134,7 +134,7 @@ def audit(defense: Defense, words: int | None, trials: int, seed: int, folder: P
 def near_words(defense: Defense, public: Public) -> Features:
     """Features near each word of the defense's dictionary, but not on it."""
     (asset,) = fields.asset_fields(defense).values()
-    used = 0 if defense.truncated_by is None else getattr(defense, defense.truncated_by)
+    used = 0 if defense.word_count_field is None else getattr(defense, defense.word_count_field)
     words = public.dictionary(asset, used).words  # (K, D)
     aside = np.random.default_rng(0).integers(-2, 2, size=words.shape, endpoint=True)
     codes = np.clip(words + aside, 0, 255).astype(np.uint8)
@@ -181,7 +181,7 @@ def _reporting_from(defense: Defense, words: int, seed: int, folder: Path) -> De
 
 def _findings(defense: Defense, secrets: Features, public: Public, trials: int, seed: int) -> Iterator[Finding]:
     """Release two descriptors again and again, and yield what each family of events shows."""
-    places = max(1, min(PLACES, trials // (DEVICES if defense.remembers() else CALLS)))
+    places = max(1, min(PLACES, trials // (DEVICES if defense.is_memoized() else CALLS)))
     calls = 4 * -(-trials // (4 * places))
     alike = secrets.take(np.zeros(2 * places, dtype=np.int64))  # pairs (d1, d1)
     mixed = secrets.take(np.arange(2 * places) % 2)  # pairs (d1, d2)
@@ -199,7 +199,7 @@ def _findings(defense: Defense, secrets: Features, public: Public, trials: int, 
     for call in range(calls):
         (neighbour, one), (neighbour_of_other, other) = released(alike, 2, call), released(mixed, 3, call)
         seen = {family: (flags(one), flags(other)) for family, flags in watched.families().items()}
-        if not defense.remembers():
+        if not defense.is_memoized():
             seen["keypoints"] = common(neighbour, one), common(neighbour_of_other, other)
             if before is not None:
                 seen["calls"] = common(before, one), common(before, other)

@@ -16,7 +16,7 @@ import numpy as np
 from bench.api import Attack, DescriptorAttack, Selection, SelectiveAttack, Trial, View
 from bench.cache import provenance, store
 from bench.core import environment
-from bench.core.errors import blamed
+from bench.core.errors import blame
 from bench.registry import spec
 from bench.types import Knowledge, Release
 
@@ -31,21 +31,21 @@ MAKERS = {
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Recovered:
+class CachedSelection:
     """What was recovered, what the attack says of it, and the seconds that were spared because it was kept."""
 
     selection: Selection
     notes: tuple[str, ...]
-    spared: float = 0.0
+    saved_seconds: float = 0.0
 
 
-def recovered(attack: Attack, trial: Trial, seen: View) -> Recovered:
+def recover_cached(attack: Attack, trial: Trial, seen: View) -> CachedSelection:
     """What the attack recovers, now or when it last saw the same. `trial.rng` is left as the attack left it."""
-    if trial.made_from is None:
+    if trial.provenance is None:
         return _attacked(attack, trial, seen)
     spent = 0.0
 
-    def make() -> store.Made:
+    def make() -> store.Content:
         nonlocal spent
         started = time.perf_counter()
         found = _attacked(attack, trial, seen)
@@ -56,10 +56,10 @@ def recovered(attack: Attack, trial: Trial, seen: View) -> Recovered:
     arrays, meta = store.fetch(KIND, _key(attack, trial), make, WORTH)
     trial.rng.bit_generator.state = meta["rng"]
     selection = Selection(rows=arrays["rows"], descriptors=arrays["descriptors"])
-    return Recovered(selection=selection, notes=tuple(meta["notes"]), spared=meta["seconds"] - spent)
+    return CachedSelection(selection=selection, notes=tuple(meta["notes"]), saved_seconds=meta["seconds"] - spent)
 
 
-def expect(array: Any, shape: tuple[int, ...]) -> None:
+def check_array(array: Any, shape: tuple[int, ...]) -> None:
     """Raise TypeError or ValueError unless it is a finite float32 array of that shape."""
     if not isinstance(array, np.ndarray):
         raise TypeError(f"returned {type(array).__name__}, expected a NumPy array")
@@ -69,19 +69,19 @@ def expect(array: Any, shape: tuple[int, ...]) -> None:
         raise ValueError("returned values that are not finite")
 
 
-def _attacked(attack: Attack, trial: Trial, seen: View) -> Recovered:
+def _attacked(attack: Attack, trial: Trial, seen: View) -> CachedSelection:
     truth = trial.secret.descriptors
-    with blamed(f"plugin {attack.name()}"):
+    with blame(f"plugin {attack.name()}"):
         if isinstance(attack, SelectiveAttack):
-            found = trial.carry_out(attack.select, seen, trial.rng)
-            expect(found.descriptors, truth[found.rows].shape)
+            found = trial.execute(attack.select, seen, trial.rng)
+            check_array(found.descriptors, truth[found.rows].shape)
         elif isinstance(attack, DescriptorAttack):
-            descriptors = trial.carry_out(attack.recover, seen, trial.rng)
-            expect(descriptors, truth.shape)
+            descriptors = trial.execute(attack.recover, seen, trial.rng)
+            check_array(descriptors, truth.shape)
             found = Selection(rows=np.arange(len(truth)), descriptors=descriptors)
         else:
             raise TypeError(f"{attack.name()} recovers neither descriptors nor images")
-    return Recovered(selection=found, notes=tuple(map(str, seen.notes)))
+    return CachedSelection(selection=found, notes=tuple(map(str, seen.notes)))
 
 
 def _key(attack: Attack, trial: Trial) -> dict[str, Any]:
@@ -91,7 +91,7 @@ def _key(attack: Attack, trial: Trial) -> dict[str, Any]:
     makers = {MAKERS[what] for what in attack.needs if what in MAKERS}
     return {
         "release": _digest(trial.release),
-        "made from": trial.made_from,
+        "made from": trial.provenance,
         "attack": spec.configuration(attack, public, attack.assets(trial.defense, extractor, public)),
         "rng": trial.rng.bit_generator.state,
         "shipped": [public.digest(asset) for asset in ("shipped", "shipped-public")] if known else [],

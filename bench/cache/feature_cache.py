@@ -40,7 +40,7 @@ def features(extractor: Extractor, pixels: Pixels) -> Features:
         if the image cannot be read, or has no keypoint.
     """
 
-    def make() -> store.Made:
+    def make() -> store.Content:
         found = extractor.extract(pixels.read(), getattr(pixels, "path", None))
         return to_arrays(found), {"size": list(found.size)}
 
@@ -83,7 +83,7 @@ def _key(extractor: Extractor, pixels: Pixels) -> dict[str, Any]:
 def nearest_words(known: Dictionary, rows: Bytes | Floats) -> Indices:
     """The nearest word of each of (N, D) rows, unless they were found before. -> (N,) int64"""
 
-    def make() -> store.Made:
+    def make() -> store.Content:
         return {"words": known.index.nearest(rows)}, {}
 
     content = hashlib.sha256(np.ascontiguousarray(rows).data).hexdigest()

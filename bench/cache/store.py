@@ -25,7 +25,7 @@ from bench.formats.tensor_file import Arrays
 VARIABLE = "FEATURE_PRIVACY_CACHE"  # of the environment: the folder
 SUFFIX = ".safetensors"
 SUMS = "SHA256SUMS"  # of a folder: its files' checksums, as sha256sum writes them
-Made = tuple[Arrays, dict[str, Any]]
+Content = tuple[Arrays, dict[str, Any]]
 
 
 def root() -> Path:
@@ -47,7 +47,7 @@ def within(folder: Path) -> Iterator[None]:
             os.environ[VARIABLE] = before
 
 
-def fetch(kind: str, key: Any, make: Callable[[], Made], worth: float = 0.0) -> Made:
+def fetch(kind: str, key: Any, make: Callable[[], Content], worth: float = 0.0) -> Content:
     """Arrays and metadata that `make` makes, unless they are kept already.
 
     Parameters

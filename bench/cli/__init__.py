@@ -14,7 +14,7 @@ from typing import NoReturn
 
 from bench.cli import commands
 from bench.cli.terminal import BROKEN_PIPE, FAILED, INTERRUPTED, MISTAKE, require, say
-from bench.core.errors import UserError, unknown
+from bench.core.errors import UserError, unknown_name
 
 GO_ON = "what was written is kept; run the same command again to go on"
 
@@ -93,14 +93,14 @@ def parser() -> Parser:
 
 def _command(argv: list[str]) -> int:
     if argv and not argv[0].startswith("-") and argv[0] not in names():
-        raise unknown("command", argv[0], names())  # argparse would refuse it without a hint
+        raise unknown_name("command", argv[0], names())  # argparse would refuse it without a hint
     args, extra = parser().parse_known_args(argv)
     if "execute" not in args:
         raise UserError(f"say what to do: {', '.join(names())} (bench --help explains)")
     if extra:
         option = extra[0].partition("=")[0]
         if option.startswith("-"):
-            raise unknown("option", option, set(re.findall(r"--[a-z][a-z-]*", args.options)))
+            raise unknown_name("option", option, set(re.findall(r"--[a-z][a-z-]*", args.options)))
         raise UserError(f"{extra[0]!r} is one argument too many")
     require(args, args.required, argv[0])
     return int(args.execute(args))

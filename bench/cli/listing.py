@@ -67,7 +67,7 @@ def _matrix() -> Iterator[Table | Text]:
     for defense in discovery.everything(discovery.DEFENSE):
         for attack in discovery.everything(discovery.ATTACK):
             try:
-                reason = task.inapplicable(spec.build(defense, {}), spec.build(attack, {}), extractor, public)
+                reason = task.explain_not_applicable(spec.build(defense, {}), spec.build(attack, {}), extractor, public)
             except UserError as error:  # a field must be given, or a file is missing
                 reason = str(error)
             table.add_row(Text(defense.name()), Text(attack.name()), "no" if reason else "yes", Text(reason or ""))

@@ -10,7 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from bench.runner import directory
-from bench.runner.status import status, told
+from bench.runner.status import status, summarize
 from leaderboard.tables import labels
 
 
@@ -23,14 +23,14 @@ def status_table(out: Path) -> Iterator[Table | Text]:
         as `status`.
     """
     found = status(out)
-    names = labels([(cell.head["defense"], cell.head["attack"]) for cell in found.cells])
-    yield Text(f"{out}: {told(found)}")
+    names = labels([(cell.metadata["defense"], cell.metadata["attack"]) for cell in found.experiments])
+    yield Text(f"{out}: {summarize(found)}")
     table = Table()
     for column in ("task", "defense", "attack", "seed", "done", "running", "failed", "missing", "n/a"):
         table.add_column(column, overflow="fold", justify="left" if column in ("task", "defense", "attack", "n/a") else "right")
-    for cell, (defense, attack) in zip(found.cells, names, strict=True):
+    for cell, (defense, attack) in zip(found.experiments, names, strict=True):
         counts = ["n/a"] * 4 if cell.reason else list(map(str, dataclasses.astuple(cell.count)))
-        row = (cell.head["task"], defense, attack, str(cell.head["seed"]), *counts, cell.reason or "")
+        row = (cell.metadata["task"], defense, attack, str(cell.metadata["seed"]), *counts, cell.reason or "")
         table.add_row(*map(Text, row))
     yield table
 
@@ -41,5 +41,5 @@ def overview_table(folder: Path) -> Table:
     for column in ("run", "status"):
         table.add_column(column, overflow="fold")
     for plan in sorted(folder.glob(f"*/{directory.PLAN}")):
-        table.add_row(Text(plan.parent.name), Text(told(status(plan.parent))))
+        table.add_row(Text(plan.parent.name), Text(summarize(status(plan.parent))))
     return table

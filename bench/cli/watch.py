@@ -14,7 +14,7 @@ from bench.runner.plan import Plan
 from bench.runner.records import Record
 
 
-def watched(plans: Sequence[Plan], out: Path, engine: Engine, title: str) -> list[Record]:
+def execute_with_progress(plans: Sequence[Plan], out: Path, engine: Engine, title: str) -> list[Record]:
     """`runner.execute`, shown. Returns the records in the order of the plans."""
     records: list[Record] = []
     noted: set[str] = set()
@@ -28,7 +28,7 @@ def watched(plans: Sequence[Plan], out: Path, engine: Engine, title: str) -> lis
             noted.update(record["notes"])
             if record["status"] == "failed":
                 progress.say(f"bench: failed: {record['unit']}, {record['defense']['name']}: {record['reason']}")
-    return plan.in_order(plans, records)
+    return plan.sort_records(plans, records)
 
 
 def print_tables(records: Sequence[Record]) -> None:

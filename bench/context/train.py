@@ -65,10 +65,10 @@ def lesson(
 
 def true_words(defense: Defense, secret: Features, public: Public) -> Indices:
     """The words that a defense quantises descriptors to. -> (N,)"""
-    if defense.quantised_by is None:
+    if defense.dictionary_field is None:
         raise TypeError(f"{defense.name()} does not quantise")
-    words = 0 if defense.truncated_by is None else getattr(defense, defense.truncated_by)
-    return public.nearest_words(getattr(defense, defense.quantised_by), secret, words)
+    words = 0 if defense.word_count_field is None else getattr(defense, defense.word_count_field)
+    return public.nearest_words(getattr(defense, defense.dictionary_field), secret, words)
 
 
 def lessons(

@@ -11,15 +11,15 @@ class UserError(Exception):
     """A mistake in what was asked: wrong name, wrong file, wrong value. Nothing has been written (exit 2)."""
 
 
-class UnitError(Exception):
+class SampleError(Exception):
     """One photograph (or query, or scene) cannot be done; its record is `failed`, the others go on (exit 1)."""
 
 
-class PluginError(UnitError):
+class PluginError(SampleError):
     """A plugin broke on one unit. The error that it raised is the `__cause__`, and its traceback is worth keeping."""
 
 
-def unknown(what: str, name: str, known: Iterable[str]) -> UserError:
+def unknown_name(what: str, name: str, known: Iterable[str]) -> UserError:
     """The error for a misspelt `name`: what comes nearest to it, and all there is to choose from."""
     choices = sorted(known)
     nearest = difflib.get_close_matches(name, choices, n=1)
@@ -28,11 +28,11 @@ def unknown(what: str, name: str, known: Iterable[str]) -> UserError:
 
 
 @contextmanager
-def blamed(who: str) -> Iterator[None]:
+def blame(who: str) -> Iterator[None]:
     """Turn whatever `who` raises into a `PluginError` that names it. Running out of memory is nobody's fault."""
     try:
         yield
-    except (UnitError, UserError, MemoryError):
+    except (SampleError, UserError, MemoryError):
         raise
     except Exception as error:
         raise PluginError(f"internal error in {who}: {type(error).__name__}: {error}") from error

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from bench.api import Extractor
-from bench.core.errors import UnitError, UserError
+from bench.core.errors import SampleError, UserError
 from bench.formats.stored_features import in_square, named, upright
 from bench.geometry.nearest_words import unit_rows
 from bench.types import Features
@@ -42,20 +42,20 @@ class ColmapDatabase(Extractor):
         numbers = _images(self.path, self.path.stat().st_mtime_ns)
         name = named(source, numbers)
         if name is None:
-            raise UnitError(f"{source.name}: {self.path} has no image of that name")
+            raise SampleError(f"{source.name}: {self.path} has no image of that name")
         number, size = numbers[name]
         with pycolmap.Database.open(self.path) as database:
             if not database.exists_keypoints(number) or not database.exists_descriptors(number):
-                raise UnitError(f"{source.name}: {self.path} has no features of it")
+                raise SampleError(f"{source.name}: {self.path} has no features of it")
             keypoints, codes = database.read_keypoints(number)[:, :2], database.read_descriptors(number).data
         if len(keypoints) != len(codes):
-            raise UnitError(f"{source.name}: {len(keypoints)} keypoints and {len(codes)} descriptors in {self.path}")
+            raise SampleError(f"{source.name}: {len(keypoints)} keypoints and {len(codes)} descriptors in {self.path}")
         upright(source, size)
         side = image.shape[0]
         xy = in_square(keypoints.astype(np.float64), size, side)  # (N, 2)
         keep = ((xy >= 0) & (xy < side)).all(axis=1) & codes.any(axis=1)
         if not keep.any():
-            raise UnitError(f"{source.name}: no keypoint of {self.path} lies in the photograph's central square")
+            raise SampleError(f"{source.name}: no keypoint of {self.path} lies in the photograph's central square")
         kept = np.ascontiguousarray(codes[keep])
         found = Features(keypoints=xy[keep].astype(np.float32), descriptors=unit_rows(kept), codes=kept, size=(side, side))
         return found.by_position()

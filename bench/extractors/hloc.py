@@ -14,7 +14,7 @@ import h5py
 import numpy as np
 
 from bench.api import Extractor
-from bench.core.errors import UnitError, UserError
+from bench.core.errors import SampleError, UserError
 from bench.formats.stored_features import in_square, named, upright
 from bench.geometry.nearest_words import unit_rows
 from bench.types import Features, Floats
@@ -45,7 +45,7 @@ class Hloc(Extractor):
         xy = in_square(keypoints + 0.5, size, side)  # (N, 2)
         keep = ((xy >= 0) & (xy < side)).all(axis=1)
         if not keep.any():
-            raise UnitError(f"{source.name}: no keypoint of {self.path} lies in the photograph's central square")
+            raise SampleError(f"{source.name}: no keypoint of {self.path} lies in the photograph's central square")
         codes = np.ascontiguousarray(descriptors[keep]) if descriptors.dtype == np.uint8 else None
         rows = unit_rows(descriptors[keep].astype(np.float32))
         found = Features(keypoints=xy[keep].astype(np.float32), descriptors=rows, codes=codes, size=(side, side))
@@ -57,26 +57,26 @@ class Hloc(Extractor):
             name = named(source, opened)
             group = None if name is None else opened[name]
             if group is None:
-                raise UnitError(f"{source.name}: {self.path} has no features of it")
+                raise SampleError(f"{source.name}: {self.path} has no features of it")
             missing = [name for name in ("keypoints", "descriptors", "image_size") if name not in group]
             if missing:
-                raise UnitError(f"{source.name}: {self.path}, group {group.name}: no dataset {missing[0]!r}")
+                raise SampleError(f"{source.name}: {self.path}, group {group.name}: no dataset {missing[0]!r}")
             keypoints, descriptors = group["keypoints"][()], group["descriptors"][()]
             width, height = (int(side) for side in group["image_size"][()])
         if keypoints.ndim != 2 or keypoints.shape[1] != 2:
-            raise UnitError(f"{source.name}: keypoints have shape {keypoints.shape}, expected (N, 2)")
+            raise SampleError(f"{source.name}: keypoints have shape {keypoints.shape}, expected (N, 2)")
         return keypoints.astype(np.float64), descriptors, (width, height)
 
 
 def _check(source: Path, descriptors: Floats, count: int, dimension: int, size: tuple[int, int]) -> None:
     if count == 0:
-        raise UnitError(f"{source.name}: no keypoint")
+        raise SampleError(f"{source.name}: no keypoint")
     if descriptors.shape != (dimension, count):
-        raise UnitError(f"{source.name}: descriptors have shape {descriptors.shape}, expected ({dimension}, {count})")
+        raise SampleError(f"{source.name}: descriptors have shape {descriptors.shape}, expected ({dimension}, {count})")
     if not np.isfinite(descriptors).all():
-        raise UnitError(f"{source.name}: descriptors hold values that are not finite")
+        raise SampleError(f"{source.name}: descriptors hold values that are not finite")
     if not descriptors.any(axis=0).all():
-        raise UnitError(f"{source.name}: a descriptor is zero")
+        raise SampleError(f"{source.name}: a descriptor is zero")
     upright(source, size)
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from bench.api import Extractor
-from bench.core.errors import UnitError, UserError
+from bench.core.errors import SampleError, UserError
 from bench.geometry.nearest_words import unit_rows
 from bench.types import Features, Indices
 
@@ -48,7 +48,7 @@ class Sift(Extractor):
         # Strongest first; equal responses in the order of their positions, so that the cut is reproducible.
         points = sorted(points, key=lambda p: (-p.response, p.pt, p.size, p.angle))[: self.max_keypoints]
         if not points:
-            raise UnitError("no keypoint was found: is the image flat?")
+            raise SampleError("no keypoint was found: is the image flat?")
         points, values = sift.compute(grey, points)
         codes = values.astype(np.uint8)  # OpenCV rounds to 0..255 and hands them out as float32
         xy = np.array([point.pt for point in points], dtype=np.float32) + 0.5  # OpenCV's centre of the first pixel is 0
@@ -78,7 +78,7 @@ class Sift(Extractor):
         order: Indices = ((row * 4 + column) * 8 + angle).ravel()
         return order
 
-    def unlimited(self) -> Extractor:
+    def without_limit(self) -> Extractor:
         return replace(self, max_keypoints=sys.maxsize)
 
 

@@ -13,7 +13,7 @@ from typing import TypeVar
 import numpy as np
 import pycolmap
 
-from bench.core.errors import UserError, unknown
+from bench.core.errors import UserError, unknown_name
 
 ROUNDING = 1e-3  # how far the norm of a quaternion in a file may be from one
 MODELS = sorted(set(pycolmap.CameraModelId.__members__) - {"INVALID"})
@@ -93,7 +93,7 @@ def camera(fields: Sequence[str], where: str) -> pycolmap.Camera:
         raise UserError(f"{where}: expected MODEL width height params, not {' '.join(fields)!r}")
     model, width, height = fields[:3]
     if model not in MODELS:
-        raise UserError(f"{where}: {unknown('camera model', model, MODELS)}")
+        raise UserError(f"{where}: {unknown_name('camera model', model, MODELS)}")
     if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
         raise UserError(f"{where}: width and height must be whole numbers above zero, not {width} {height}")
     found = pycolmap.Camera.create_from_model_name(1, model, 1.0, int(width), int(height))

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from bench.core.errors import UnitError
+from bench.core.errors import SampleError
 
 ORIENTATION = 0x0112  # the EXIF tag; 1 is upright
 
@@ -45,12 +45,12 @@ def upright(source: Path, size: tuple[int, int] | None = None) -> tuple[int, int
         with Image.open(source) as opened:
             if size is not None and opened.size != size:
                 told = f"the features are of an image of {size} pixels, the photograph has {opened.size}"
-                raise UnitError(f"{source.name}: {told}")
+                raise SampleError(f"{source.name}: {told}")
             if opened.getexif().get(ORIENTATION, 1) != 1:
-                raise UnitError(f"{source.name}: it has an EXIF rotation, which such features do not follow")
+                raise SampleError(f"{source.name}: it has an EXIF rotation, which such features do not follow")
             return opened.size
     except OSError as error:
-        raise UnitError(f"{source.name}: cannot be read as an image: {error}") from error
+        raise SampleError(f"{source.name}: cannot be read as an image: {error}") from error
 
 
 def _corner(size: tuple[int, int]) -> np.ndarray:

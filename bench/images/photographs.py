@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageOps
 
-from bench.core.errors import UnitError, UserError
+from bench.core.errors import SampleError, UserError
 from bench.types import Bytes
 
 SIDE = 256  # pixels
@@ -147,12 +147,12 @@ def decode(path: Path, upright: bool = True) -> tuple[Image.Image, tuple[str, ..
             opened.load()
             image = ImageOps.exif_transpose(opened) if upright else opened
     except Image.DecompressionBombError as error:
-        raise UnitError(f"{path.name}: too many pixels to be read safely ({error})") from error
+        raise SampleError(f"{path.name}: too many pixels to be read safely ({error})") from error
     except (OSError, SyntaxError, ValueError) as error:
         # Pillow says "image file is truncated", "cannot identify image file", ...
-        raise UnitError(f"{path.name}: cannot be read as an image: {error}") from error
+        raise SampleError(f"{path.name}: cannot be read as an image: {error}") from error
     if min(image.size) < SMALLEST:
-        raise UnitError(f"{path.name}: {image.width} x {image.height} pixels; at least {SMALLEST} x {SMALLEST} are needed")
+        raise SampleError(f"{path.name}: {image.width} x {image.height} pixels; at least {SMALLEST} x {SMALLEST} are needed")
     notes = []
     if image.mode.startswith("I") or image.mode == "F":
         notes.append(f"{path.name}: 16 bits a channel, scaled to 8")

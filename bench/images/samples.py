@@ -22,7 +22,7 @@ Images = Path | str | Sequence[Path | str | Source] | None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Unit:
+class Sample:
     """One thing that is judged. The runner extracts and protects each of its images."""
 
     name: str
@@ -41,12 +41,12 @@ class Collection:
     """The units of a run, and what they share."""
 
     name: str
-    units: tuple[Unit, ...]
+    samples: tuple[Sample, ...]
     scene: Scene | None = None  # the place that they are of, if they are of one
     beside: Mapping[str, str] = field(default_factory=dict)  # digests of what results depend on beside the units' images
 
 
-def of_photographs(images: Images) -> Collection:
+def collect_photographs(images: Images) -> Collection:
     """A unit for each photograph of a folder, or of those given; the built-in ones for None.
 
     Raises
@@ -55,17 +55,17 @@ def of_photographs(images: Images) -> Collection:
         if there is no such folder, it holds no photograph, or two have one name.
     """
     name, sources = _photographs(images)
-    return Collection(name=name, units=tuple(Unit(name=source.name, images=(source,)) for source in sources))
+    return Collection(name=name, samples=tuple(Sample(name=source.name, images=(source,)) for source in sources))
 
 
-def photographs_alone(task: Task, images: Images, dataset: Dataset | None) -> Collection:
+def collect_only_photographs(task: Task, images: Images, dataset: Dataset | None) -> Collection:
     """`of_photographs`, for a task that judges nothing else; raises UserError if it is given a place."""
     if dataset is not None:
         raise UserError(f"{task.name()} judges photographs and takes no dataset; give --images")
-    return of_photographs(images)
+    return collect_photographs(images)
 
 
-def of_queries(dataset: Dataset) -> Collection:
+def collect_queries(dataset: Dataset) -> Collection:
     """A unit for each query of a dataset's scene.
 
     Raises
@@ -76,10 +76,10 @@ def of_queries(dataset: Dataset) -> Collection:
     scene = dataset.scene()
     if not scene.queries:
         raise UserError(f"{scene.name}: the scene has no queries")
-    units = (Unit(name=query.name, images=(query.pixels,), condition=query.condition, subject=query) for query in scene.queries)
+    units = (Sample(name=query.name, images=(query.pixels,), condition=query.condition, subject=query) for query in scene.queries)
     return Collection(
         name=scene.name,
-        units=tuple(units),
+        samples=tuple(units),
         scene=scene,
         beside={"scene": digest([scene.unit, fingerprint(scene.references), fingerprint(scene.queries)])},
     )
@@ -101,7 +101,7 @@ def fingerprint(images: Sequence[SceneImage]) -> str:
     return digest(known)
 
 
-def read(image: ImageSource) -> tuple[Bytes, tuple[str, ...]]:
+def read_pixels(image: ImageSource) -> tuple[Bytes, tuple[str, ...]]:
     """The pixels, (H, W, 3) uint8 RGB, and notes on what was converted.
 
     Raises
@@ -115,12 +115,12 @@ def read(image: ImageSource) -> tuple[Bytes, tuple[str, ...]]:
     return image.read(), ()
 
 
-def foreground(image: ImageSource) -> Mask | None:
+def read_foreground(image: ImageSource) -> Mask | None:
     """(H, W), True where something hides the scene that moves; None where that is not known."""
     return None if isinstance(image, Source) else image.foreground()
 
 
-def path(image: ImageSource) -> Path | None:
+def image_path(image: ImageSource) -> Path | None:
     """The file that an image is in, if it is in one."""
     return getattr(image, "path", None)
 

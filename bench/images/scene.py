@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.core.errors import UnitError
+from bench.core.errors import SampleError
 from bench.images.photographs import Source, decode
 from bench.types import Bytes
 
@@ -64,7 +64,7 @@ class File(Pixels):
     def _decoded(self, path: Path) -> Image:
         image, _ = decode(path, upright=False)
         if image.size != self.size:
-            raise UnitError(f"{path}: {image.width} x {image.height} pixels; its camera says {self.size[0]} x {self.size[1]}")
+            raise SampleError(f"{path}: {image.width} x {image.height} pixels; its camera says {self.size[0]} x {self.size[1]}")
         return image
 
 

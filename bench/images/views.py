@@ -11,7 +11,7 @@ from typing import overload
 import numpy as np
 
 from bench.api import Extractor
-from bench.core.errors import UnitError, UserError
+from bench.core.errors import SampleError, UserError
 from bench.core.progress import Progress
 from bench.images.photographs import Source, decode, square
 from bench.types import Bytes, Features
@@ -92,7 +92,7 @@ class OnDemand(Sequence[PhotographView]):
 
     def __iter__(self) -> Iterator[PhotographView]:
         for place in range(len(self)):
-            with suppress(UnitError):
+            with suppress(SampleError):
                 yield self[place]
 
 
@@ -114,7 +114,7 @@ def collect(sources: list[Source], extractor: Extractor) -> list[PhotographView]
         for source in sources:
             try:
                 collected += list(views(source, extractor))
-            except UnitError as error:
+            except SampleError as error:
                 progress.say(f"left out: {error}")
             progress.advance()
     if not collected:

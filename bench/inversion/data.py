@@ -17,7 +17,7 @@ import numpy as np
 from bench.api import Asset, Between, Defense, OneOf
 from bench.codebook.dictionary import Dictionary
 from bench.codebook.public import Public
-from bench.core.errors import UnitError, UserError
+from bench.core.errors import SampleError, UserError
 from bench.core.progress import Progress
 from bench.geometry.nearest_words import unit_rows
 from bench.geometry.row_keys import row_keys
@@ -59,7 +59,7 @@ class Examples:
             if no view out of 100 can be used.
         """
         for _ in range(100):
-            with suppress(UnitError):  # of photographs that are read on demand, for others have been read already
+            with suppress(SampleError):  # of photographs that are read on demand, for others have been read already
                 view = self.views[int(rng.integers(len(self.views)))]
                 break
         else:
@@ -75,8 +75,8 @@ class Examples:
 
     def _release(self, photograph: str, pixels: Bytes, secret: Features, rng: np.random.Generator) -> Example:
         settings: dict[str, object] = {field: setting.sample(rng) for field, setting in self.served.items()}
-        if self.defense.quantised_by is not None:
-            settings[self.defense.quantised_by] = self.dictionaries[photograph]
+        if self.defense.dictionary_field is not None:
+            settings[self.defense.dictionary_field] = self.dictionaries[photograph]
         defense = dataclasses.replace(self.defense, **settings)  # type: ignore[type-var]  # plugins are dataclasses
         return Example(pixels, defense.protect(secret, self.public, rng), condition(defense, self.served))
 

@@ -131,9 +131,9 @@ def _examples(
 ) -> tuple[Examples, Examples, dict[str, float] | None]:
     """Training and validation examples, and the quantisation error on both where descriptors are quantised."""
     defense, served = plan.defense, plan.served
-    if defense.quantised_by is None:
+    if defense.dictionary_field is None:
         return Examples(views, defense, served, {}, Public()), Examples(unseen, defense, served, {}, Public()), None
-    own = Asset(getattr(defense, defense.quantised_by))
+    own = Asset(getattr(defense, defense.dictionary_field))
     plain = Public()
     chosen = fitting_dictionaries(photographs_of(views), [own, *plan.crossfit], plain)
     chosen_unseen = fitting_dictionaries(photographs_of(unseen), [own], plain)
@@ -152,10 +152,10 @@ def _examples(
 
 def _sizes(defense: Defense, served: Served) -> list[int]:
     """How many words the dictionary may have in training, all (0) first and then the most."""
-    if defense.truncated_by is None:
+    if defense.word_count_field is None:
         return [0]
-    setting = served.get(defense.truncated_by)
-    sizes = [int(size) for size in setting.values] if isinstance(setting, OneOf) else [getattr(defense, defense.truncated_by)]
+    setting = served.get(defense.word_count_field)
+    sizes = [int(size) for size in setting.values] if isinstance(setting, OneOf) else [getattr(defense, defense.word_count_field)]
     return sorted(sizes, key=lambda size: (size > 0, -size))
 
 

@@ -163,7 +163,7 @@ def inapplicable(name: str, defense: Defense) -> str | None:
     if not issubclass(defense.releases, matcher.accepts):
         accepted = " or ".join(kind.__name__ for kind in matcher.accepts)
         return f"{name} matches {accepted}; {defense.name()} releases {defense.releases.__name__}"
-    if matcher.by_words and defense.quantised_by is None:
+    if matcher.by_words and defense.dictionary_field is None:
         return f"{name} matches words of a dictionary; {defense.name()} has none"
     if matcher.for_noise and not defense.noisy:
         return f"{name} matches descriptors that are buried in noise; those of {defense.name()} are not"

@@ -15,7 +15,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from bench.core.errors import unknown
+from bench.core.errors import unknown_name
 
 Doubles = NDArray[np.float64]
 Solver = Literal["poselib", "pycolmap"]
@@ -60,7 +60,7 @@ def estimate(
         if there is no such solver.
     """
     if solver not in get_args(Solver):
-        raise unknown("solver", solver, get_args(Solver))
+        raise unknown_name("solver", solver, get_args(Solver))
     if len(xy) < LEAST:
         return None
     solve = _poselib if solver == "poselib" and camera.model.name in SHARED else _pycolmap

@@ -98,10 +98,10 @@ class Place:
         arrays, meta = store.fetch(dictionary.KIND, [self.digest, size], lambda: self._clustered(size))
         return Dictionary(arrays["words"], meta, f"{self.digest}, {size} words")
 
-    def _clustered(self, size: int) -> store.Made:
+    def _clustered(self, size: int) -> store.Content:
         codes = self._codes(self.extractor)
         if len(codes) < size:
-            codes = self._codes(self.extractor.unlimited())
+            codes = self._codes(self.extractor.without_limit())
         if len(codes) < size:
             raise UserError(f"{self.scene.name}: its references have {len(codes)} descriptors, too few for {size} words")
         words = build.cluster(codes, size, np.random.default_rng(SEED))

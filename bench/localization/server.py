@@ -48,10 +48,10 @@ class Server:
 
     def dictionary(self, defense: Defense) -> Dictionary | None:
         """That whose words a defense releases, if it has one."""
-        if defense.quantised_by is None:
+        if defense.dictionary_field is None:
             return None
-        words = 0 if defense.truncated_by is None else getattr(defense, defense.truncated_by)
-        return self.public.dictionary(getattr(defense, defense.quantised_by), words)
+        words = 0 if defense.word_count_field is None else getattr(defense, defense.word_count_field)
+        return self.public.dictionary(getattr(defense, defense.dictionary_field), words)
 
     def seen_by(self, query: Features, count: int = TOP) -> Indices:
         """The references that look most like a query, by its raw descriptors: the same for every defense. -> (count,)"""

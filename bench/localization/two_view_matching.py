@@ -22,10 +22,10 @@ from bench.types import Descriptors, Features, Indices, Release, Subspaces, Word
 
 def unprotected(features: Features, defense: Defense, public: Public) -> Release:
     """Raw features, made ready to be matched with a release of that defense: quantised where it releases words."""
-    if defense.quantised_by is None:
+    if defense.dictionary_field is None:
         return Descriptors(keypoints=features.keypoints, size=features.size, descriptors=features.descriptors)
-    asset = fields.asset_fields(defense)[defense.quantised_by]
-    count = 0 if defense.truncated_by is None else int(getattr(defense, defense.truncated_by))
+    asset = fields.asset_fields(defense)[defense.dictionary_field]
+    count = 0 if defense.word_count_field is None else int(getattr(defense, defense.word_count_field))
     nearest = public.nearest_words(asset, features, count)[:, None]  # (N, 1)
     return WordSets(keypoints=features.keypoints, size=features.size, candidates=features.descriptors[:, None], words=nearest)
 

@@ -37,9 +37,9 @@ def protect(features: Features, defense: Defense, public: Public | None = None, 
         if the defense's dictionary is missing or damaged, or does not fit the features; or the key is.
     """
     public = public or Public()
-    if defense.remembers() and device is None:
+    if defense.is_memoized() and device is None:
         raise UserError(f"{defense.name()}, as configured, needs the file of the device's key: protect(..., device=PATH)")
-    if device is not None and not defense.remembers():
+    if device is not None and not defense.is_memoized():
         raise UserError(f"{defense.name()}, as configured, does not remember: a key would make all releases draw alike")
     key = secrets.token_bytes(KEY) if device is None else _derived(_device_key(Path(device)), defense, public)
     return defense.protect(features, public, generator(key))

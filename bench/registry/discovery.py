@@ -18,7 +18,7 @@ from importlib.metadata import entry_points
 from typing import Any, Generic, TypeVar
 
 from bench.api import Dataset, Defense, DescriptorAttack, Extractor, ImageAttack, Metric, Plugin, SelectiveAttack, Task
-from bench.core.errors import UserError, unknown
+from bench.core.errors import UserError, unknown_name
 from bench.registry import fields
 
 P = TypeVar("P", bound=Plugin)
@@ -79,7 +79,7 @@ def lookup(kind: Kind[P], name: str) -> type[P]:
     """
     found = discover(kind)
     if name not in found:
-        raise unknown(kind.word, name, found)
+        raise unknown_name(kind.word, name, found)
     return _register(kind, found[name])
 
 

@@ -8,7 +8,7 @@ from importlib.metadata import version
 from pathlib import Path
 from string import Template
 
-from bench.core.errors import UserError, unknown
+from bench.core.errors import UserError, unknown_name
 from bench.registry import discovery
 from bench.registry.discovery import Kind
 
@@ -36,7 +36,7 @@ def write(word: str, name: str, out: Path) -> list[Path]:
         if there is no such kind of plugin, the name cannot be one, is taken, or `out` holds something already.
     """
     if word not in KINDS:
-        raise unknown("kind of plugin", word, KINDS)
+        raise unknown_name("kind of plugin", word, KINDS)
     module = name.replace("-", "_")
     if not NAME.fullmatch(name) or keyword.iskeyword(module):
         raise UserError(f"{name!r} cannot be a plugin's name: write small letters, digits and - between words")

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from bench.api import Plugin
-from bench.core.errors import UserError, unknown
+from bench.core.errors import UserError, unknown_name
 from bench.core.exact import Exact
 from bench.registry import discovery, fields
 from bench.registry.discovery import Kind
@@ -37,7 +37,7 @@ def parse(text: str, kind: Kind[P]) -> tuple[type[P], dict[str, Any]]:
         if not equals:
             raise UserError(f"{text!r}: {part!r} is not field=value (a plugin is written name:field=value,field=value)")
         if field not in types:
-            raise unknown(f"field of {plugin.name()}", field, types)
+            raise unknown_name(f"field of {plugin.name()}", field, types)
         if field in given:
             raise UserError(f"{text!r}: {field} is given twice")
         given[field] = _value(plugin, field, types[field], value)

@@ -24,7 +24,7 @@ from safetensors.numpy import load, save
 from bench.api import Extractor, Selection, View
 from bench.codebook.dictionary import Dictionary
 from bench.codebook.public import Public
-from bench.core.errors import UnitError
+from bench.core.errors import SampleError
 from bench.images.scene import Scene
 from bench.localization.scene_index import Place
 from bench.types import Knowledge, Release
@@ -32,7 +32,7 @@ from bench.types import Knowledge, Release
 Method = Callable[[View, np.random.Generator], Any]
 
 
-def isolated(method: Method, view: View, rng: np.random.Generator) -> Any:
+def execute_in_attack_process(method: Method, view: View, rng: np.random.Generator) -> Any:
     """What `method(view, rng)` returns, `rng` and the view's notes being left as it leaves them. A `CarryOut`.
 
     Raises
@@ -52,7 +52,7 @@ def isolated(method: Method, view: View, rng: np.random.Generator) -> Any:
         return _answered(ours, view, rng)
     except (EOFError, ConnectionError):
         process.join()
-        raise UnitError(f"the process of the attack ended with status {process.exitcode}") from None
+        raise SampleError(f"the process of the attack ended with status {process.exitcode}") from None
     finally:
         ours.close()
         process.join(1)
@@ -71,7 +71,7 @@ def _answered(ours: Connection, view: View, rng: np.random.Generator) -> Any:
             view.notes.extend(told["notes"])
             return Selection(**arrays) if told["selection"] else arrays["found"]
         elif told["kind"] == "unit error":
-            raise UnitError(told["text"])
+            raise SampleError(told["text"])
         else:
             raise RuntimeError(told["text"])
 
@@ -108,7 +108,7 @@ def _carry_out(theirs: Connection) -> None:
         told = {"kind": "done", "selection": selection, "rng": rng.bit_generator.state, "notes": list(map(str, view.notes))}
         theirs.send_bytes(json.dumps(told).encode())
         theirs.send_bytes(blob)
-    except UnitError as error:
+    except SampleError as error:
         theirs.send_bytes(json.dumps({"kind": "unit error", "text": str(error)}).encode())
     except Exception:
         theirs.send_bytes(json.dumps({"kind": "error", "text": traceback.format_exc()}).encode())

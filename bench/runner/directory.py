@@ -22,7 +22,7 @@ from bench.runner.records import Record, key
 if TYPE_CHECKING:
     from bench.runner.engines import Job
     from bench.runner.plan import Plan
-    from bench.runner.trial import Made
+    from bench.runner.trial import Result
 
 ERRORS = "errors.log"
 PLAN = "plan.json"
@@ -30,12 +30,12 @@ RUNNING = "running.json"
 KEPT = ("task", "defense", "attack", "dataset", "seed", "cell_id", "run_hash")  # of a cell's head
 
 
-def picture(out: Path, record: Record) -> Path:
+def reconstruction_path(out: Path, record: Record) -> Path:
     """Where the reconstruction of a record is kept."""
     return out / "reconstructions" / record["cell_id"] / f"{record['unit']}.png"
 
 
-def keep(made: Made, out: Path) -> None:
+def write_result(made: Result, out: Path) -> None:
     """Write what belongs to a record, before the record itself.
 
     Raises
@@ -44,7 +44,7 @@ def keep(made: Made, out: Path) -> None:
         if it cannot be written.
     """
     if made.picture is not None:
-        path = picture(out, made.record)
+        path = reconstruction_path(out, made.record)
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(made.picture)
     if made.trace is not None:
@@ -62,8 +62,8 @@ def write_plan(out: Path, plans: Sequence[Plan]) -> None:
     """
     written = [
         {
-            "units": [unit.name for unit in plan.units],
-            "cells": [{name: cell.head[name] for name in KEPT} | {"reason": cell.reason} for cell in plan.cells],
+            "units": [unit.name for unit in plan.samples],
+            "cells": [{name: cell.metadata[name] for name in KEPT} | {"reason": cell.reason} for cell in plan.experiments],
         }
         for plan in plans
     ]
@@ -87,7 +87,7 @@ def read_plan(out: Path) -> list[dict[str, Any]]:
         raise UserError(f"{path}: no JSON ({error}); run what was run there again, and it is written anew") from None
 
 
-class InHand:
+class RunningJobs:
     """The jobs in hand, in a file that is there while there are any."""
 
     def __init__(self, out: Path, engine: str) -> None:
@@ -118,7 +118,7 @@ class InHand:
             _replace(self._path, self._who | {"jobs": list(self._jobs)})
 
 
-def read_hand(out: Path) -> dict[str, Any] | None:
+def read_running(out: Path) -> dict[str, Any] | None:
     """Who is at work, or was when it ended without notice; None if nobody."""
     try:
         return json.loads((out / RUNNING).read_bytes())

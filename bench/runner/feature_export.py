@@ -15,8 +15,8 @@ import h5py
 import numpy as np
 
 from bench.api import Attack, ImageAttack, Trial
-from bench.cache.attack_cache import recovered
-from bench.core.errors import UnitError, UserError
+from bench.cache.attack_cache import recover_cached
+from bench.core.errors import SampleError, UserError
 from bench.formats.stored_features import out_of_square, upright
 from bench.tasks.reconstruction import view
 from bench.types import Bytes, Descriptors, Floats, WordSets
@@ -47,9 +47,9 @@ def described(trial: Trial, path: Path, attack: Attack | None) -> Described:
     """
     release = trial.release
     if isinstance(attack, ImageAttack):
-        raise UnitError(f"{attack.name()} recovers no descriptors")
+        raise SampleError(f"{attack.name()} recovers no descriptors")
     if attack is not None:
-        found = recovered(attack, trial, view(trial)).selection
+        found = recover_cached(attack, trial, view(trial)).selection
         keypoints, rows = release.keypoints[found.rows], found.descriptors
     elif isinstance(release, Descriptors):
         keypoints, rows = release.keypoints, release.descriptors
@@ -57,10 +57,10 @@ def described(trial: Trial, path: Path, attack: Attack | None) -> Described:
         keypoints = np.repeat(release.keypoints, release.subset_size, axis=0)  # (N m, 2)
         rows = release.candidates.reshape(len(keypoints), -1)  # (N m, D)
     else:
-        raise UnitError(f"a release of {type(release).__name__} has no descriptors; --attack exports what is recovered of it")
+        raise SampleError(f"a release of {type(release).__name__} has no descriptors; --attack exports what is recovered of it")
     size = upright(path)
     moved = out_of_square(keypoints.astype(np.float64), size, release.size[0]).astype(np.float32)
-    return Described(name=trial.unit.name, path=path, size=size, keypoints=moved, descriptors=rows)
+    return Described(name=trial.sample.name, path=path, size=size, keypoints=moved, descriptors=rows)
 
 
 def to_hloc(found: Sequence[Described], out: Path) -> None:

@@ -16,14 +16,14 @@ from PIL import Image
 
 from bench.api import Defense, Extractor
 from bench.codebook.public import Public
-from bench.core.errors import UnitError
+from bench.core.errors import SampleError
 from bench.images.photographs import SIDE, Source, decode
 from bench.types import Bytes, Release
 
 LARGEST = 640  # pixels of the short side that windows are cut from
 
 
-class Population:
+class OtherReleases:
     """An endless list of releases of one defense, the k-th a function of (randomness, k) alone, each made once.
 
     Parameters
@@ -67,14 +67,14 @@ class Population:
 
     def _make(self, k: int) -> Release | None:
         try:
-            pixels = window(self._sources[k % len(self._sources)], self._randomness("window", k))
+            pixels = random_window(self._sources[k % len(self._sources)], self._randomness("window", k))
             secret = self._extractor.extract(pixels)
-        except UnitError:
+        except SampleError:
             return None
         return self._defense.protect(secret, self._public, self._randomness("release", k))
 
 
-def window(source: Source, rng: np.random.Generator) -> Bytes:
+def random_window(source: Source, rng: np.random.Generator) -> Bytes:
     """A random square of at least 256 pixels, or the largest there is, mirrored or not, resized to 256. -> (256, 256, 3)
 
     Raises

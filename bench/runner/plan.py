@@ -11,19 +11,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bench.api import Attack, CarryOut, Dataset, Defense, Extractor, Metric, Plugin, Privacy, Task, at_once
+from bench.api import Attack, Dataset, Defense, Execute, Extractor, Metric, Plugin, Privacy, Task, execute_in_process
 from bench.cache import feature_cache
 from bench.codebook.public import Public
 from bench.core import environment, hashing
 from bench.core.errors import UserError
 from bench.extractors.sift import Sift
-from bench.images.samples import Images, Unit
+from bench.images.samples import Images, Sample
 from bench.localization.scene_index import Place
 from bench.registry import discovery, fields, spec
 from bench.runner import directory, engines, records, trial
 from bench.runner.engines import Engine, Job
-from bench.runner.records import EVERY_UNIT, Record
-from bench.runner.trial import Made, Trials
+from bench.runner.records import EVERY_SAMPLE, Record
+from bench.runner.trial import Result, Trials
 from bench.tasks.reconstruction import Reconstruction
 from bench.types import Knowledge
 
@@ -31,18 +31,18 @@ Describe = Callable[[Iterable[object]], Mapping[str, Any]]  # from plugins to th
 
 
 @dataclass(frozen=True, eq=False)
-class Cell:
+class Experiment:
     """One defense against one attack."""
 
     defense: Defense
     attack: Attack | None
     privacy: Privacy
-    head: Record  # what all its records begin with
+    metadata: Record  # what all its records begin with
     reason: str | None  # why it does not apply, if it does not
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Asked:
+class RunConfiguration:
     """What a plan is made from. Can be pickled, so that other processes make the same plan."""
 
     pairs: tuple[tuple[Defense, Attack | None], ...]
@@ -58,26 +58,28 @@ class Asked:
 class Plan:
     """Everything that a run will do, checked as far as it can be without doing it."""
 
-    asked: Asked
+    configuration: RunConfiguration
     task: Task
-    cells: tuple[Cell, ...]
-    units: tuple[Unit, ...]
+    experiments: tuple[Experiment, ...]
+    samples: tuple[Sample, ...]
     hashes: Mapping[str, str]  # unit's name -> its content's hash
     extractor: Extractor
     metrics: tuple[Metric, ...]
     public: Public
     seed: int
-    carry_out: CarryOut = at_once  # where attacks are carried out
+    execute: Execute = execute_in_process  # where attacks are carried out
 
     @property
     def hash(self) -> str:
         """Of configuration and inputs."""
-        return hashing.short_hash(sorted(cell.head["cell_id"] for cell in self.cells))
+        return hashing.short_hash(sorted(cell.metadata["cell_id"] for cell in self.experiments))
 
     @property
     def needs_map(self) -> bool:
         """Whether some cell will ask for the place's map."""
-        return self.task.mapped or any(cell.attack is not None and Knowledge.MAP in cell.attack.needs for cell in self.cells)
+        return self.task.needs_map or any(
+            cell.attack is not None and Knowledge.MAP in cell.attack.needs for cell in self.experiments
+        )
 
     def __len__(self) -> int:
         """The number of its records."""
@@ -85,12 +87,12 @@ class Plan:
 
     def record_keys(self) -> Iterator[tuple[str, str]]:
         """What its records are known by, `run_hash` and unit, in order."""
-        for place, unit in enumerate(self.units):
-            for cell in self.cells:
+        for place, unit in enumerate(self.samples):
+            for cell in self.experiments:
                 if cell.reason is None:
-                    yield cell.head["run_hash"], unit.name
+                    yield cell.metadata["run_hash"], unit.name
                 elif place == 0:  # what holds for every unit comes with the first
-                    yield cell.head["run_hash"], EVERY_UNIT
+                    yield cell.metadata["run_hash"], EVERY_SAMPLE
 
 
 def run(
@@ -124,7 +126,7 @@ def run(
         if something is wrong with what was asked; nothing has been written then.
     """
     plan = prepare(defenses, attacks, images, extractor=extractor, task=task, dataset=dataset, seed=seed, metrics=metrics)
-    return in_order([plan], execute([plan], None if out is None else Path(out)))
+    return sort_records([plan], execute([plan], None if out is None else Path(out)))
 
 
 def prepare(
@@ -146,11 +148,11 @@ def prepare(
         if something is wrong with it, or no pair of it applies.
     """
     task = task or Reconstruction()
-    pairs = crossed(task, defenses, attacks)
+    pairs = cross(task, defenses, attacks)
     return prepare_pairs(pairs, images, extractor=extractor, task=task, dataset=dataset, seed=seed, metrics=metrics)
 
 
-def crossed(task: Task, defenses: Sequence[Defense], attacks: Sequence[Attack] = ()) -> tuple[tuple[Defense, Attack | None], ...]:
+def cross(task: Task, defenses: Sequence[Defense], attacks: Sequence[Attack] = ()) -> tuple[tuple[Defense, Attack | None], ...]:
     """Every defense with every attack, or with None where the task judges the release itself.
 
     Raises
@@ -160,9 +162,9 @@ def crossed(task: Task, defenses: Sequence[Defense], attacks: Sequence[Attack] =
     """
     if not defenses:
         raise UserError("no defense was given")
-    if task.attacked and not attacks:
+    if task.judges_attacks and not attacks:
         raise UserError(f"{task.name()} needs an attack")
-    if not task.attacked and attacks:
+    if not task.judges_attacks and attacks:
         raise UserError(f"{task.name()} judges the release itself and takes no attack")
     tried: Sequence[Attack | None] = attacks or [None]
     return tuple((defense, attack) for defense in defenses for attack in tried)
@@ -185,7 +187,7 @@ def prepare_pairs(
     UserError
         as `prepare`.
     """
-    asked = Asked(
+    asked = RunConfiguration(
         pairs=tuple(pairs),
         images=images,
         task=task,
@@ -197,7 +199,7 @@ def prepare_pairs(
     return prepared(asked)
 
 
-def prepared(asked: Asked, describe: Describe = environment.describe) -> Plan:
+def prepared(asked: RunConfiguration, describe: Describe = environment.describe) -> Plan:
     """The plan, once a keypoint was protected by each of its defenses, so that a user's mistake shows before anything is written.
 
     Raises
@@ -206,13 +208,13 @@ def prepared(asked: Asked, describe: Describe = environment.describe) -> Plan:
         as `prepare`.
     """
     plan = planned(asked, describe)
-    if all(cell.reason for cell in plan.cells):
-        raise UserError("nothing to run: " + "; ".join(sorted({str(cell.reason) for cell in plan.cells})))
+    if all(cell.reason for cell in plan.experiments):
+        raise UserError("nothing to run: " + "; ".join(sorted({str(cell.reason) for cell in plan.experiments})))
     Trials(plan).rehearse()
     return plan
 
 
-def planned(asked: Asked, describe: Describe = environment.describe) -> Plan:
+def planned(asked: RunConfiguration, describe: Describe = environment.describe) -> Plan:
     """The plan, before anything was tried. `describe` tells the environment in which it will be carried out.
 
     Raises
@@ -221,8 +223,8 @@ def planned(asked: Asked, describe: Describe = environment.describe) -> Plan:
         if something is wrong with what was asked.
     """
     task, extractor, dataset, seed = asked.task, asked.extractor, asked.dataset, asked.seed
-    collection = task.collection(asked.images, dataset)
-    hashes = {unit.name: unit.content_hash() for unit in collection.units}
+    collection = task.collect(asked.images, dataset)
+    hashes = {unit.name: unit.content_hash() for unit in collection.samples}
     place = None if collection.scene is None else Place(collection.scene, extractor)
     public = Public(feature_cache.nearest_words, place=place)
     judged = {
@@ -231,14 +233,14 @@ def planned(asked: Asked, describe: Describe = environment.describe) -> Plan:
         "hash": hashing.digest(hashes | dict(collection.beside)),
         "extractor": spec.configuration(extractor, public),
     }
-    metrics = (*_metrics(), *asked.metrics) if task.attacked else ()
+    metrics = (*_metrics(), *asked.metrics) if task.judges_attacks else ()
     settings = {metric.name(): _settings(metric) for metric in metrics}
     taking_part = [plugin for pair in asked.pairs for plugin in pair if plugin is not None]
     ran = dict(describe([task, extractor, *taking_part, *metrics]))
     cells = []
     for defense, attack in asked.pairs:
         protected = spec.configuration(defense, public)
-        reason = task.inapplicable(defense, attack, extractor, public)
+        reason = task.explain_not_applicable(defense, attack, extractor, public)
         head = {
             "schema": records.SCHEMA,
             "task": task.name(),
@@ -250,14 +252,14 @@ def planned(asked: Asked, describe: Describe = environment.describe) -> Plan:
             "seed": seed,
             "sources": {"defense": environment.file_digest(defense), "attack": attack and environment.file_digest(attack)},
         }
-        cell_id = records.cell_id(spec.written(task), head["defense"], head["attack"], judged, seed, settings)
+        cell_id = records.experiment_id(spec.written(task), head["defense"], head["attack"], judged, seed, settings)
         head |= {"cell_id": cell_id, "run_hash": records.run_hash(cell_id, ran), "environment": ran}
-        cells.append(Cell(defense, attack, defense.privacy(public), head, reason))
-    unique = {cell.head["cell_id"]: cell for cell in cells}  # one that was asked for twice is done once
-    return Plan(asked, task, tuple(unique.values()), collection.units, hashes, extractor, metrics, public, seed)
+        cells.append(Experiment(defense, attack, defense.privacy(public), head, reason))
+    unique = {cell.metadata["cell_id"]: cell for cell in cells}  # one that was asked for twice is done once
+    return Plan(asked, task, tuple(unique.values()), collection.samples, hashes, extractor, metrics, public, seed)
 
 
-def execute(plans: Sequence[Plan], out: Path | None = None, engine: Engine = engines.HERE) -> Iterator[Record]:
+def execute(plans: Sequence[Plan], out: Path | None = None, engine: Engine = engines.IN_PROCESS) -> Iterator[Record]:
     """Do what was planned and yield its records: first those that `out` holds already, then others as they are made.
 
     What several plans have in common is done once. A folder is written by one process at a time, and by this one alone, whatever
@@ -285,15 +287,15 @@ def execute(plans: Sequence[Plan], out: Path | None = None, engine: Engine = eng
         done = {records.key(record): record for record in log.before.records if record["status"] != "failed"}
         held = [done[key] for key in dict.fromkeys(key for plan in plans for key in plan.record_keys()) if key in done]
         yield from held
-        with directory.InHand(out, engine.name) as hand:
+        with directory.RunningJobs(out, engine.name) as hand:
             for made in _made(plans, set(map(records.key, held)), engine, hand.taken):
-                directory.keep(made, out)
+                directory.write_result(made, out)
                 log.append(made.record)
                 hand.done(made.record)
                 yield made.record
 
 
-def in_order(plans: Sequence[Plan], found: Iterable[Record]) -> list[Record]:
+def sort_records(plans: Sequence[Plan], found: Iterable[Record]) -> list[Record]:
     """Records in the order of the plans, which does not depend on who made them, or when."""
     places = {key: place for place, key in enumerate(dict.fromkeys(key for plan in plans for key in plan.record_keys()))}
     return sorted(found, key=lambda record: places[records.key(record)])
@@ -304,15 +306,17 @@ def _made(
     done: set[tuple[str, str]],
     engine: Engine,
     watched: Callable[[Iterator[Job]], Iterator[Job]] = lambda jobs: jobs,
-) -> Iterator[Made]:
+) -> Iterator[Result]:
     """What is not done yet: first what does not apply and needs nobody to do it."""
     begun = set(done)
-    for cell in (cell for plan in plans for cell in plan.cells if cell.reason is not None):
-        if (key := (cell.head["run_hash"], EVERY_UNIT)) not in begun:
+    for cell in (cell for plan in plans for cell in plan.experiments if cell.reason is not None):
+        if (key := (cell.metadata["run_hash"], EVERY_SAMPLE)) not in begun:
             begun.add(key)
-            yield Made(record=trial.record(cell, None, status="n/a", reason=cell.reason))
+            yield Result(record=trial.record(cell, None, status="n/a", reason=cell.reason))
     jobs: dict[tuple[str, str], Job] = {}
-    for job in (Job(plan, cell, unit) for plan in plans for unit in plan.units for cell in plan.cells if cell.reason is None):
+    for job in (
+        Job(plan, cell, unit) for plan in plans for unit in plan.samples for cell in plan.experiments if cell.reason is None
+    ):
         if job.key not in done:
             jobs.setdefault(job.key, job)
     yield from engine(watched(iter(jobs.values())))
@@ -338,4 +342,4 @@ def _attack_configuration(
         return None
     if reason is not None:
         return spec.written(attack)
-    return spec.configuration(attack, public, task.resolved(defense, attack, extractor, public))
+    return spec.configuration(attack, public, task.resolve(defense, attack, extractor, public))

@@ -24,10 +24,10 @@ Record = dict[str, Any]
 
 SCHEMA = 1
 FILE = "records.jsonl"
-EVERY_UNIT = "*"  # the unit of a record that holds for the whole cell, such as one that does not apply
+EVERY_SAMPLE = "*"  # the unit of a record that holds for the whole cell, such as one that does not apply
 
 
-def cell_id(task: Any, defense: Any, attack: Any, dataset: dict[str, Any], seed: int, metric_settings: Any) -> str:
+def experiment_id(task: Any, defense: Any, attack: Any, dataset: dict[str, Any], seed: int, metric_settings: Any) -> str:
     """Hash of the configuration and the inputs. How a dataset is called is neither."""
     content = {key: value for key, value in dataset.items() if key not in ("name", "spec")}
     return short_hash([SCHEMA, task, defense, attack, content, seed, metric_settings])
@@ -104,7 +104,7 @@ def load_records(path: str | Path) -> pd.DataFrame:
     return pd.json_normalize([_with_infinity(record) for record in latest(contents.records)])
 
 
-def locked(path: Path) -> bool:
+def is_locked(path: Path) -> bool:
     """Whether a process that lives is writing to that file of records."""
     try:
         with path.open("rb") as file:

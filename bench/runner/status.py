@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.runner import directory, records
-from bench.runner.records import EVERY_UNIT, Record
+from bench.runner.records import EVERY_SAMPLE, Record
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,10 +29,10 @@ class Count:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class CellStatus:
+class ExperimentStatus:
     """How far a cell is."""
 
-    head: Mapping[str, Any]  # what its records begin with
+    metadata: Mapping[str, Any]  # what its records begin with
     count: Count
     reason: str | None  # why it does not apply, if it does not
 
@@ -41,7 +41,7 @@ class CellStatus:
 class Status:
     """How far the last plan of a folder is."""
 
-    cells: tuple[CellStatus, ...]
+    experiments: tuple[ExperimentStatus, ...]
     other: int  # records of other plans, or of other source, libraries or machines
     writer: Mapping[str, Any] | None  # who is at work, or was when it ended without notice
     alive: bool  # whether somebody is
@@ -49,12 +49,12 @@ class Status:
     @property
     def count(self) -> Count:
         """Of all cells that apply."""
-        return sum((cell.count for cell in self.cells if cell.reason is None), Count())
+        return sum((cell.count for cell in self.experiments if cell.reason is None), Count())
 
     @property
     def inapplicable(self) -> int:
         """Cells that do not apply."""
-        return sum(cell.reason is not None for cell in self.cells)
+        return sum(cell.reason is not None for cell in self.experiments)
 
 
 def status(out: Path) -> Status:
@@ -68,19 +68,19 @@ def status(out: Path) -> Status:
     plans = directory.read_plan(out)
     file = out / records.FILE
     found = {records.key(record): record for record in (records.read(file).records if file.is_file() else ())}
-    alive, writer = records.locked(file), directory.read_hand(out)
+    alive, writer = records.is_locked(file), directory.read_running(out)
     in_hand = {(run_hash, unit) for run_hash, unit in (writer or {}).get("jobs", ())} if alive else set()
     cells = {}
     for plan in plans:
         for cell in plan["cells"]:
             states = Counter(_state((cell["run_hash"], unit), found, in_hand) for unit in plan["units"])
             count = Count() if cell["reason"] else Count(**states)
-            cells[cell["run_hash"]] = CellStatus(head=cell, count=count, reason=cell["reason"])
-    planned = {(cell["run_hash"], unit) for plan in plans for cell in plan["cells"] for unit in (*plan["units"], EVERY_UNIT)}
-    return Status(cells=tuple(cells.values()), other=len(found.keys() - planned), writer=writer, alive=alive)
+            cells[cell["run_hash"]] = ExperimentStatus(metadata=cell, count=count, reason=cell["reason"])
+    planned = {(cell["run_hash"], unit) for plan in plans for cell in plan["cells"] for unit in (*plan["units"], EVERY_SAMPLE)}
+    return Status(experiments=tuple(cells.values()), other=len(found.keys() - planned), writer=writer, alive=alive)
 
 
-def told(found: Status) -> str:
+def summarize(found: Status) -> str:
     """A status in one line."""
     count = found.count
     parts = [

@@ -21,11 +21,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bench.api import Attack, Dataset, Defense, Extractor, Task
-from bench.core.errors import UserError, unknown
+from bench.core.errors import UserError, unknown_name
 from bench.extractors.sift import Sift
 from bench.images.samples import Images
 from bench.runner import plan
-from bench.runner.plan import Asked
+from bench.runner.plan import RunConfiguration
 from bench.tasks.reconstruction import Reconstruction
 
 PACKAGE = "suites"
@@ -36,7 +36,7 @@ class Suite:
     """Experiments that belong together. Each part has one task, one set of images, one extractor and one seed."""
 
     summary: str
-    parts: tuple[Asked, ...]
+    parts: tuple[RunConfiguration, ...]
 
     def on(self, images: Images) -> Suite:
         """The same with other photographs, where it judges photographs."""
@@ -53,7 +53,7 @@ def grid(
     datasets: Sequence[Dataset | None] = (None,),
     extractors: Sequence[Extractor] = (Sift(),),
     seeds: Sequence[int] = (0,),
-) -> tuple[Asked, ...]:
+) -> tuple[RunConfiguration, ...]:
     """Every defense against every attack, judged by every task, for every dataset, extractor and seed.
 
     A task that judges the release itself takes no attack, and `attacks` are not for it.
@@ -64,8 +64,8 @@ def grid(
         if there is no defense, or no attack for a task that needs one.
     """
     return tuple(
-        Asked(
-            pairs=plan.crossed(task, defenses, attacks if task.attacked else ()),
+        RunConfiguration(
+            pairs=plan.cross(task, defenses, attacks if task.judges_attacks else ()),
             images=images,
             task=task,
             extractor=extractor,
@@ -93,7 +93,7 @@ def find(text: str) -> Suite:
     place, colon, attribute = text.rpartition(":")
     if not colon:
         if text not in names():
-            raise unknown("suite", text, names())
+            raise unknown_name("suite", text, names())
         place, attribute = f"{PACKAGE}.{text.replace('-', '_')}", "SUITE"
     try:
         module = importlib.import_module(_module(place))

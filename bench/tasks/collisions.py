@@ -18,13 +18,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.api import Attack, Dataset, Defense, Extractor, Lifting, Outcome, Task, Trial, leads_through_no_word
+from bench.api import Attack, Dataset, Defense, Extractor, Lifting, Outcome, Task, Trial, explain_no_words
 from bench.codebook.public import Public
-from bench.core.errors import UnitError, UserError
+from bench.core.errors import SampleError, UserError
 from bench.geometry.intersections import MEETS, Doubles
 from bench.geometry.nearest_words import unit_rows
 from bench.geometry.shared_sub_database import company, nearest_that_meet
-from bench.images.samples import Collection, Images, photographs_alone
+from bench.images.samples import Collection, Images, collect_only_photographs
 from bench.registry import fields
 from bench.types import Release, Subspaces
 
@@ -33,7 +33,7 @@ from bench.types import Release, Subspaces
 class Collisions(Task):
     """How often no other release that meets a subspace comes near its descriptor. Made by the owner, who knows what it hides."""
 
-    attacked = False
+    judges_attacks = False
 
     coverage: float = 0.95  # releases are asked for until this share of the photograph's words is met
     others: int = 800  # releases of other photographs that there are to ask for
@@ -47,20 +47,20 @@ class Collisions(Task):
         if not self.tolerance >= 0:
             raise UserError(f"collisions: tolerance must be at least 0, got {self.tolerance}")
 
-    def collection(self, images: Images, dataset: Dataset | None) -> Collection:
-        return photographs_alone(self, images, dataset)
+    def collect(self, images: Images, dataset: Dataset | None) -> Collection:
+        return collect_only_photographs(self, images, dataset)
 
-    def inapplicable(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> str | None:
-        return leads_through_no_word(defense)
+    def explain_not_applicable(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> str | None:
+        return explain_no_words(defense)
 
-    def resolved(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> Mapping[str, Any]:
+    def resolve(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> Mapping[str, Any]:
         return {}
 
-    def judge(self, trial: Trial) -> Outcome:
+    def evaluate(self, trial: Trial) -> Outcome:
         defense = trial.defense
         if not isinstance(defense, Lifting):
-            raise UnitError("collisions needs subspaces through words of a database")
-        lifted = defense.lifted(trial.secret, trial.public, trial.rng)
+            raise SampleError("collisions needs subspaces through words of a database")
+        lifted = defense.lift(trial.secret, trial.public, trial.rng)
         words = trial.public.dictionary(fields.asset_fields(defense)["database"]).words  # (K, D)
         points = np.concatenate(
             [trial.secret.descriptors[:, None], unit_rows(words[lifted.words])], axis=1
@@ -91,7 +91,7 @@ def no_collision(nearest: Doubles, tolerance: float) -> NDArray[np.bool_]:
 def _subspaces(releases: Iterator[Release]) -> Iterator[Subspaces]:
     for release in releases:
         if not isinstance(release, Subspaces):
-            raise UnitError(f"collisions needs subspaces, got {type(release).__name__}")
+            raise SampleError(f"collisions needs subspaces, got {type(release).__name__}")
         yield release
 
 

@@ -20,12 +20,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.api import Attack, Dataset, Defense, Extractor, Lifting, Outcome, Task, Trial, leads_through_no_word
+from bench.api import Attack, Dataset, Defense, Extractor, Lifting, Outcome, Task, Trial, explain_no_words
 from bench.codebook.public import Public
-from bench.core.errors import UnitError, UserError
+from bench.core.errors import SampleError, UserError
 from bench.geometry.nearest_words import unit_rows
 from bench.geometry.subspaces import nearest_to_subspaces
-from bench.images.samples import Collection, Images, photographs_alone
+from bench.images.samples import Collection, Images, collect_only_photographs
 from bench.registry import fields
 from bench.types import Features, Floats
 
@@ -40,7 +40,7 @@ class Intersections(Task):
     The descriptors of a photograph are lifted again and again until there are `subspaces` liftings, or each once for 0.
     """
 
-    attacked = False
+    judges_attacks = False
 
     ratio: float = 0.8  # of the distances to the nearest and the second nearest; a match is below it
     subspaces: int = 0  # lifted of each photograph
@@ -51,24 +51,24 @@ class Intersections(Task):
         if self.subspaces < 0:
             raise UserError(f"intersections: subspaces must be at least 0, got {self.subspaces}")
 
-    def collection(self, images: Images, dataset: Dataset | None) -> Collection:
-        return photographs_alone(self, images, dataset)
+    def collect(self, images: Images, dataset: Dataset | None) -> Collection:
+        return collect_only_photographs(self, images, dataset)
 
-    def inapplicable(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> str | None:
-        return leads_through_no_word(defense)
+    def explain_not_applicable(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> str | None:
+        return explain_no_words(defense)
 
-    def resolved(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> Mapping[str, Any]:
+    def resolve(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> Mapping[str, Any]:
         return {}
 
-    def judge(self, trial: Trial) -> Outcome:
+    def evaluate(self, trial: Trial) -> Outcome:
         defense = trial.defense
         if not isinstance(defense, Lifting):
-            raise UnitError("intersections needs subspaces through words of a database")
+            raise SampleError("intersections needs subspaces through words of a database")
         words = trial.public.dictionary(fields.asset_fields(defense)["database"]).words  # (K, D)
         count = self.subspaces or len(trial.secret)
         alone, among = [], []
         for secret in rounds(trial.secret, count, trial.rng):
-            lifted = defense.lifted(secret, trial.public, trial.rng)
+            lifted = defense.lift(secret, trial.public, trial.rng)
             near, _ = nearest_to_subspaces(lifted.release, words, max(COUNTS) + defense.adversarial)  # (n, N + a)
             for rows in np.array_split(np.arange(len(near)), -(-len(near) // BATCH)):
                 points = np.concatenate(

@@ -15,7 +15,7 @@ import numpy as np
 
 from bench.api import Attack, Dataset, Defense, Extractor, Outcome, Task, Trial
 from bench.codebook.public import Public
-from bench.core.errors import UnitError, UserError
+from bench.core.errors import SampleError, UserError
 from bench.datasets.gallery import Gallery
 from bench.formats import lists
 from bench.images import samples
@@ -37,9 +37,9 @@ class Localization(Task):
     paper does not count) or `released` (by nothing but what was released), unless a file of pairs is given.
     """
 
-    attacked: ClassVar[bool] = False
-    places: ClassVar[bool] = True
-    mapped: ClassVar[bool] = True
+    judges_attacks: ClassVar[bool] = False
+    needs_scene: ClassVar[bool] = True
+    needs_map: ClassVar[bool] = True
 
     # auto: what serves the release best, where references are not lifted
     matcher: Literal["auto", "vocabulary", "noisy-nn", "mutual-nn", "point-to-subspace", "subspace-to-subspace"] = "auto"
@@ -52,25 +52,25 @@ class Localization(Task):
         if self.retrieved < 1 or self.trials < 1:
             raise UserError("localization: retrieved and trials must be at least 1")
 
-    def collection(self, images: Images, dataset: Dataset | None) -> Collection:
+    def collect(self, images: Images, dataset: Dataset | None) -> Collection:
         if images is not None:
             raise UserError("localization is about the queries of a dataset and takes no images; give --dataset")
-        return samples.of_queries(dataset or Gallery())
+        return samples.collect_queries(dataset or Gallery())
 
-    def inapplicable(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> str | None:
+    def explain_not_applicable(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> str | None:
         name = self._matcher(defense)
         return f"nothing matches {defense.releases.__name__}" if name is None else map_matching.inapplicable(name, defense)
 
-    def resolved(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> Mapping[str, Any]:
+    def resolve(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> Mapping[str, Any]:
         return {}
 
-    def judge(self, trial: Trial) -> Outcome:
-        query: SceneImage = trial.unit.subject
+    def evaluate(self, trial: Trial) -> Outcome:
+        query: SceneImage = trial.sample.subject
         server = Server(public=trial.public, camera=query.camera)
         _check(server, trial.secret, query.name)
         matcher = self._matcher(trial.defense)
         if matcher is None:
-            raise UnitError(f"nothing matches {type(trial.release).__name__}")
+            raise SampleError(f"nothing matches {type(trial.release).__name__}")
         references, seed = self._retrieved(server, trial, query), int(trial.rng.integers(2**31))
         found = server.localize(trial.release, trial.defense, references, matcher, self.trials, seed)
         told = {
@@ -105,7 +105,7 @@ def _check(server: Server, secret: Features, query: str) -> None:
     if query not in known:
         known[query] = server.misfit(secret)
     if (ratio := known[query]) is not None:
-        raise UnitError(f"{query}: its intrinsics do not fit; its raw features ask for {ratio:.2f} times the focal length")
+        raise SampleError(f"{query}: its intrinsics do not fit; its raw features ask for {ratio:.2f} times the focal length")
 
 
 def within(errors: tuple[float, float] | None) -> dict[str, float | None]:

@@ -25,8 +25,8 @@ from scipy.spatial import cKDTree
 from bench.api import Attack, Dataset, Defense, Extractor, Outcome, Task, Trial
 from bench.codebook.public import Public
 from bench.core import hashing
-from bench.core.errors import UnitError, UserError
-from bench.images.samples import Collection, Images, Unit
+from bench.core.errors import SampleError, UserError
+from bench.images.samples import Collection, Images, Sample
 from bench.localization import two_view_matching
 from bench.rendering import homographies
 from bench.rendering.homographies import Pair
@@ -46,7 +46,7 @@ class Matching(Task):
     The first image is privatised; the second is not, unless `both` says so.
     """
 
-    attacked: ClassVar[bool] = False
+    judges_attacks: ClassVar[bool] = False
 
     both: bool = False  # whether the second image is privatised, too
     ratio: float = 1.0  # of Lowe's test, for what is mutually nearest; 1 asks for nothing
@@ -58,7 +58,7 @@ class Matching(Task):
         if self.each < 1:
             raise UserError(f"matching: each must be at least 1, got {self.each}")
 
-    def collection(self, images: Images, dataset: Dataset | None) -> Collection:
+    def collect(self, images: Images, dataset: Dataset | None) -> Collection:
         if dataset is not None:
             raise UserError("matching judges pairs of images and takes no dataset; give --images with a folder of HPatches")
         if images is None:
@@ -67,19 +67,19 @@ class Matching(Task):
             raise UserError("matching judges pairs of images; give a folder of HPatches")
         return _collected(Path(images).resolve().name, homographies.hpatches(Path(images)))
 
-    def inapplicable(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> str | None:
+    def explain_not_applicable(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> str | None:
         if issubclass(defense.releases, (Descriptors, Subspaces, WordSets)):
             return None
         return f"nothing matches {defense.releases.__name__}"
 
-    def resolved(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> Mapping[str, Any]:
+    def resolve(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> Mapping[str, Any]:
         return {}
 
-    def judge(self, trial: Trial) -> Outcome:
-        pair = trial.unit.subject
+    def evaluate(self, trial: Trial) -> Outcome:
+        pair = trial.sample.subject
         if not isinstance(pair, Pair):
-            raise UnitError("matching needs a pair of images with a homography")
-        query, reference = trial.shots
+            raise SampleError("matching needs a pair of images with a homography")
+        query, reference = trial.images
         second = reference.release if self.both else two_view_matching.unprotected(reference.secret, trial.defense, trial.public)
         found = two_view_matching.matches(query.release, second, self.ratio)
         return Outcome(metrics=accuracy(query.release.keypoints, second.keypoints, pair.homography, found))
@@ -126,7 +126,7 @@ def _collected(name: str, pairs: Sequence[Pair]) -> Collection:
     homographies_of = {pair.name: pair.homography.tolist() for pair in pairs}
     return Collection(
         name=name,
-        units=tuple(Unit(name=pair.name, images=(pair.first, pair.second), subject=pair) for pair in pairs),
+        samples=tuple(Sample(name=pair.name, images=(pair.first, pair.second), subject=pair) for pair in pairs),
         beside={"homographies": hashing.digest(homographies_of)},
     )
 

@@ -13,7 +13,7 @@ import numpy as np
 from bench.api import Attack, Dataset, Defense, Extractor, ImageAttack, LocalMetric, Metric, Outcome, Selection, Task, Trial, View
 from bench.cache import attack_cache
 from bench.codebook.public import Public
-from bench.core.errors import UnitError, UserError, blamed
+from bench.core.errors import SampleError, UserError, blame
 from bench.images import samples
 from bench.images.samples import Collection, Images
 from bench.images.scene import Mask
@@ -30,27 +30,27 @@ class Reconstruction(Task):
     Where an attack recovers descriptors, the `inverter` paints them: the network for raw descriptors.
     """
 
-    attacked = True
+    judges_attacks = True
 
     inverter: str = "dia"  # an attack that reconstructs images
 
-    def collection(self, images: Images, dataset: Dataset | None) -> Collection:
+    def collect(self, images: Images, dataset: Dataset | None) -> Collection:
         if dataset is None:
-            return samples.of_photographs(images)
+            return samples.collect_photographs(images)
         if images is not None:
             raise UserError("reconstruction takes photographs or the queries of a dataset, not both")
-        return samples.of_queries(dataset)
+        return samples.collect_queries(dataset)
 
-    def inapplicable(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> str | None:
+    def explain_not_applicable(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> str | None:
         if attack is None:
             return "reconstruction needs an attack"
         missing = attack.needs - offered(attack, defense, public).keys() - RELEASES
         if missing:
             wanted = " and ".join(sorted(need.value for need in missing))
             return f"{attack.name()} needs {wanted}; there is none for {defense.name()}"
-        return attack.inapplicable(defense, extractor, public)
+        return attack.explain_not_applicable(defense, extractor, public)
 
-    def resolved(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> Mapping[str, Any]:
+    def resolve(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> Mapping[str, Any]:
         if attack is None:
             return {}
         for what, load in offered(attack, defense, public).items():
@@ -64,22 +64,22 @@ class Reconstruction(Task):
             return digests | {"inversion": None}
         return digests | {"inversion": spec.configuration(inverter, public, inverter.assets(undefended, extractor, public))}
 
-    def judge(self, trial: Trial) -> Outcome:
+    def evaluate(self, trial: Trial) -> Outcome:
         attack = trial.attack
         if attack is None:
-            raise UnitError("reconstruction needs an attack")
+            raise SampleError("reconstruction needs an attack")
         if isinstance(attack, ImageAttack):
             return compared(trial, None, reconstructed(attack, view(trial), trial))
-        found = attack_cache.recovered(attack, trial, view(trial))
+        found = attack_cache.recover_cached(attack, trial, view(trial))
         inverter, undefended, reason = self._inverter(trial.extractor, trial.public)
         if reason is not None:
             outcome = compared(trial, found.selection, None, (*found.notes, f"no image: {reason}"))
-            return dataclasses.replace(outcome, spared=found.spared)
+            return dataclasses.replace(outcome, saved_seconds=found.saved_seconds)
         keypoints = trial.release.keypoints[found.selection.rows]
         release = Descriptors(keypoints=keypoints, size=trial.release.size, descriptors=found.selection.descriptors)
         seen = view(dataclasses.replace(trial.released(release), attack=inverter, defense=undefended))
         outcome = compared(trial, found.selection, reconstructed(inverter, seen, trial), found.notes)
-        return dataclasses.replace(outcome, spared=found.spared)
+        return dataclasses.replace(outcome, saved_seconds=found.saved_seconds)
 
     def _inverter(self, extractor: Extractor, public: Public) -> tuple[ImageAttack, Defense, str | None]:
         """The attack that paints descriptors, the defense that it was made for, and why it cannot be used, if it cannot."""
@@ -87,7 +87,7 @@ class Reconstruction(Task):
         if not isinstance(inverter, ImageAttack):
             raise UserError(f"reconstruction: inverter must reconstruct images, and {inverter.name()} does not")
         undefended = discovery.lookup(discovery.DEFENSE, "none")()
-        return inverter, undefended, inverter.inapplicable(undefended, extractor, public)
+        return inverter, undefended, inverter.explain_not_applicable(undefended, extractor, public)
 
 
 def offered(attack: Attack, defense: Defense, public: Public) -> dict[Knowledge, Callable[[], Any]]:
@@ -125,15 +125,15 @@ def view(trial: Trial) -> View:
 def _served(trial: Trial) -> Any:
     from bench.localization.server import Server  # it brings COLMAP with it
 
-    return Server(public=trial.public, camera=trial.unit.subject.camera)
+    return Server(public=trial.public, camera=trial.sample.subject.camera)
 
 
 def reconstructed(attack: ImageAttack, seen: View, trial: Trial) -> Floats:
     """The attacker's image. -> (H, W, 3)"""
-    with blamed(f"plugin {attack.name()}"):
-        image: Floats = trial.carry_out(attack.reconstruct, seen, trial.rng)
+    with blame(f"plugin {attack.name()}"):
+        image: Floats = trial.execute(attack.reconstruct, seen, trial.rng)
         width, height = seen.release.size
-        attack_cache.expect(image, (height, width, 3))
+        attack_cache.check_array(image, (height, width, 3))
         if image.min() < 0 or image.max() > 1:
             raise ValueError(f"returned values from {image.min()} to {image.max()}, expected 0 to 1")
     return image
@@ -153,7 +153,7 @@ def compared(trial: Trial, found: Selection | None, image: Floats | None, notes:
                 else _measured(metric, trial.secret.descriptors[found.rows], found.descriptors)
             )
             values[metric.name()] = described
-    if image is not None and (mask := trial.shots[0].foreground()) is not None:
+    if image is not None and (mask := trial.images[0].foreground()) is not None:
         values |= parts(trial.metrics, truth, image, mask)
     return Outcome(metrics=values, image=image, notes=notes)
 
@@ -163,7 +163,7 @@ def parts(metrics: Sequence[Metric], truth: Floats, image: Floats, mask: Mask) -
     values: dict[str, float | None] = {}
     for metric in metrics:
         if isinstance(metric, LocalMetric):
-            with blamed(f"plugin {metric.name()}"):
+            with blame(f"plugin {metric.name()}"):
                 each = metric.local(truth, image)  # (H, W)
             for part, inside in (("foreground", mask), ("background", ~mask)):
                 values[f"{metric.name()}_{part}"] = float(each[inside].mean()) if inside.any() else None
@@ -171,7 +171,7 @@ def parts(metrics: Sequence[Metric], truth: Floats, image: Floats, mask: Mask) -
 
 
 def _measured(metric: Metric, truth: Floats, estimate: Floats) -> float | None:
-    with blamed(f"plugin {metric.name()}"):
+    with blame(f"plugin {metric.name()}"):
         value = metric(truth, estimate)
         if value is not None and not np.isfinite(value):
             raise ValueError(f"returned {value}; a metric returns None where its value is not finite")

@@ -16,10 +16,10 @@ import pycolmap
 
 from bench.api import Attack, Dataset, Defense, Extractor, Outcome, Task, Trial
 from bench.codebook.public import Public
-from bench.core.errors import UnitError, UserError
+from bench.core.errors import SampleError, UserError
 from bench.datasets.walk import Walk
 from bench.images import samples
-from bench.images.samples import Collection, Images, Unit
+from bench.images.samples import Collection, Images, Sample
 from bench.images.scene import SceneImage
 from bench.localization import two_view_matching
 from bench.sfm import agreement, incremental_mapping, picture, verification
@@ -34,8 +34,8 @@ class Structure(Task):
     The references, if there are any, serve for the dictionary alone.
     """
 
-    attacked: ClassVar[bool] = False
-    places: ClassVar[bool] = True
+    judges_attacks: ClassVar[bool] = False
+    needs_scene: ClassVar[bool] = True
 
     images: int = 25  # the first queries of the place, at most
     ratio: float = 0.8  # of Lowe's test among descriptors; 1 asks for nothing
@@ -49,7 +49,7 @@ class Structure(Task):
         if self.mapper not in ("incremental", "global"):
             raise UserError(f"structure: mapper must be incremental or global, got {self.mapper}")
 
-    def collection(self, images: Images, dataset: Dataset | None) -> Collection:
+    def collect(self, images: Images, dataset: Dataset | None) -> Collection:
         if images is not None:
             raise UserError(
                 "structure is about a place and takes no images; give --dataset, such as captured:path=DIR,leading=25"
@@ -61,20 +61,20 @@ class Structure(Task):
         for image in chosen:
             if _intrinsics(image.camera) != _intrinsics(chosen[0].camera):
                 raise UserError(f"{scene.name}: {chosen[0].name} and {image.name} are of different cameras; structure takes one")
-        unit = Unit(name=scene.name, images=tuple(image.pixels for image in chosen), subject=chosen)
-        return Collection(name=scene.name, units=(unit,), scene=scene, beside={"scene": samples.fingerprint(chosen)})
+        unit = Sample(name=scene.name, images=tuple(image.pixels for image in chosen), subject=chosen)
+        return Collection(name=scene.name, samples=(unit,), scene=scene, beside={"scene": samples.fingerprint(chosen)})
 
-    def inapplicable(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> str | None:
+    def explain_not_applicable(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> str | None:
         if issubclass(defense.releases, (Descriptors, Subspaces, WordSets)):
             return None
         return f"nothing matches {defense.releases.__name__}"
 
-    def resolved(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> Mapping[str, Any]:
+    def resolve(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> Mapping[str, Any]:
         return {}
 
-    def judge(self, trial: Trial) -> Outcome:
-        images: tuple[SceneImage, ...] = trial.unit.subject
-        releases = [shot.release for shot in trial.shots]
+    def evaluate(self, trial: Trial) -> Outcome:
+        images: tuple[SceneImage, ...] = trial.sample.subject
+        releases = [shot.release for shot in trial.images]
         keypoints = [release.keypoints for release in releases]
         camera, seed = images[0].camera, int(trial.rng.integers(2**31))
         found = {(a, b): self._matches(releases[a], releases[b]) for a, b in itertools.combinations(range(len(releases)), 2)}
@@ -97,7 +97,7 @@ class Structure(Task):
             ratio = 1.0 if isinstance(first, Subspaces) else self.ratio
             return two_view_matching.matches(first, second, ratio, unique=True)
         except TypeError as error:
-            raise UnitError(str(error)) from None
+            raise SampleError(str(error)) from None
 
 
 def measured(model: Model | None, truth: Sequence[pycolmap.Rigid3d | None]) -> dict[str, float | None]:

@@ -12,7 +12,7 @@ from rich.text import Text
 
 from bench.api import Asset, Dataset, Extractor
 from bench.core import threads
-from bench.core.errors import UserError, unknown
+from bench.core.errors import UserError, unknown_name
 from bench.extractors.sift import Sift
 from bench.runner import engines
 from bench.runner.engines import Engine
@@ -60,7 +60,7 @@ def reproduce(
     """
     known, drawings = tables.everything(), drawn_by()
     if name not in {**known, **drawings}:
-        raise unknown("table", name, [*known, *drawings])
+        raise unknown_name("table", name, [*known, *drawings])
     sizes, table = profile(size), known.get(name)
     of_place = name in of_places()
     if of_place and images is not None:
@@ -79,7 +79,7 @@ def reproduce(
         seed=seed,
     )
     folder = out or Path("runs") / f"reproduce-{sizes.name}-{_named(images, judged)}"
-    engine = engines.choose(workers or (threads.cores() if of_place else 1))
+    engine = engines.choose_engine(workers or (threads.cores() if of_place else 1))
     if table is None:
         return _figures(name, drawings[name], setting, judged, folder, engine)
     rebuilt = run.rebuild(table, setting, judged, folder, engine)

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from PIL import Image
 
-from bench.core.errors import UnitError
+from bench.core.errors import SampleError
 from bench.images import samples
-from bench.runner.directory import picture
+from bench.runner.directory import reconstruction_path
 from bench.types import Bytes
 from leaderboard.figures import Panel
 from leaderboard.reproduce.profiles import Setting
@@ -41,8 +41,8 @@ class Scene:
     def originals(self) -> Iterator[tuple[str, Bytes]]:
         """The names of the units that can be read, and their pixels."""
         for unit in self.judged.units:
-            with contextlib.suppress(UnitError):
-                yield unit.name, samples.read(unit.images[0])[0]
+            with contextlib.suppress(SampleError):
+                yield unit.name, samples.read_pixels(unit.images[0])[0]
 
     def panel(self, row: str, unit: str, title: str = "", shown: Mapping[str, str] = SSIM, digits: int = 3) -> Panel:
         """The picture made of a unit in a row of a table, with metrics beneath, by label; or why there is none."""
@@ -50,7 +50,7 @@ class Scene:
             if record["status"] == "n/a":
                 return Panel(None, title, "n/a")
             if record["unit"] == unit:
-                path = picture(self.out, record)
+                path = reconstruction_path(self.out, record)
                 scores = {label: record["metrics"].get(metric) for label, metric in shown.items()}
                 told = ", ".join(f"{label} {score:.{digits}f}" for label, score in scores.items() if score is not None)
                 return Panel(np.asarray(Image.open(path)) if path.is_file() else None, title, told or record["status"])

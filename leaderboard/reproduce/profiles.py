@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from bench.api import Asset, Extractor
-from bench.core.errors import unknown
+from bench.core.errors import unknown_name
 from bench.datasets.gallery import Gallery
 from bench.datasets.walk import Walk
 
@@ -124,5 +124,5 @@ def profile(name: str) -> Profile:
         if there is none.
     """
     if name not in PROFILES:
-        raise unknown("profile", name, PROFILES)
+        raise unknown_name("profile", name, PROFILES)
     return PROFILES[name]

@@ -13,9 +13,9 @@ from bench.api import Dataset, Task
 from bench.core.progress import Progress
 from bench.images import photographs, samples
 from bench.images.photographs import Source
-from bench.images.samples import Unit
+from bench.images.samples import Sample
 from bench.runner import plan as runner
-from bench.runner.engines import HERE, Engine
+from bench.runner.engines import IN_PROCESS, Engine
 from bench.runner.plan import Plan
 from bench.runner.records import Record
 from leaderboard.intervals import Interval, interval, proportion, rank_correlation
@@ -36,9 +36,11 @@ class Judged:
     dataset: Dataset | None = None  # the place
 
     @property
-    def units(self) -> tuple[Unit, ...]:
+    def units(self) -> tuple[Sample, ...]:
         """What records are about."""
-        return (samples.of_photographs(self.chosen) if self.dataset is None else samples.of_queries(self.dataset)).units
+        return (
+            samples.collect_photographs(self.chosen) if self.dataset is None else samples.collect_queries(self.dataset)
+        ).samples
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -96,7 +98,7 @@ def queries(dataset: Dataset) -> Judged:
     return Judged(name=f"queries of {scene.name}", names=names, available=len(names), dataset=dataset)
 
 
-def rebuild(table: Table, setting: Setting, judged: Judged, out: Path, engine: Engine = HERE) -> Rebuilt:
+def rebuild(table: Table, setting: Setting, judged: Judged, out: Path, engine: Engine = IN_PROCESS) -> Rebuilt:
     """Run what `out` does not hold yet, and weigh the claims.
 
     Raises
@@ -119,7 +121,7 @@ def execute(
     judged: Judged,
     out: Path,
     title: str,
-    engine: Engine = HERE,
+    engine: Engine = IN_PROCESS,
     seeds: Iterable[int] | None = None,
 ) -> Ran:
     """Run the rows, one plan for each task and seed, that of the setting alone for None.
@@ -137,7 +139,7 @@ def execute(
             if record["status"] == "failed":
                 progress.say(f"bench: failed: {record['unit']}, {record['defense']['name']}: {record['reason']}")
     records: dict[str, list[Record]] = {}
-    for record in runner.in_order(plans, found):
+    for record in runner.sort_records(plans, found):
         records.setdefault(record["cell_id"], []).append(record)
     return Ran(rows=tuple(rows), cells=cells, records={cell: tuple(its) for cell, its in records.items()})
 
@@ -193,9 +195,9 @@ def _plan(task: Task, rows: Sequence[Row], setting: Setting, judged: Judged, see
 
 def _cells(row: Row, plans: Sequence[Plan]) -> tuple[str, ...]:
     return tuple(
-        str(cell.head["cell_id"])
+        str(cell.metadata["cell_id"])
         for plan in plans
-        for cell in plan.cells
+        for cell in plan.experiments
         if (plan.task, cell.defense, cell.attack) == (row.task, row.defense, row.attack)
     )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bench.images import photographs
-from bench.runner.plan import Asked
+from bench.runner.plan import RunConfiguration
 from bench.runner.suite import Suite
 from leaderboard.reproduce import run, tables
 from leaderboard.reproduce.profiles import CPU, Materials, Setting
@@ -19,7 +19,7 @@ def of_table(name: str) -> Suite:
     setting = Setting(profile=CPU, materials=Materials(), extractor=extractor, photographs=len(photographs.builtin()))
     rows = (*table.rows(setting), *table.borrowed(setting))
     parts = [
-        Asked(
+        RunConfiguration(
             pairs=tuple((row.defense, row.attack) for row in rows if row.task == task),
             images=None,
             task=task,

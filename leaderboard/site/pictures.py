@@ -11,7 +11,7 @@ from pathlib import Path
 from PIL import Image
 
 from bench.core import hashing
-from bench.core.errors import UnitError
+from bench.core.errors import SampleError
 from bench.images import photographs
 from bench.images.photographs import Source
 from bench.runner import directory
@@ -34,7 +34,7 @@ class Pair:
 def pairs(found: Iterable[Found], out: Path) -> Iterator[tuple[Record, Pair]]:
     """The records of which there is a reconstruction, with their pictures, which are written into the site `out`."""
     for one in found:
-        made = _as_it_is(one.folder, directory.picture(one.folder, one.record), out)
+        made = _as_it_is(one.folder, directory.reconstruction_path(one.folder, one.record), out)
         if made is not None:
             original = _as_it_is(one.folder, run_report.photograph(one.folder, one.record), out) or _builtin(one.record, out)
             yield one.record, Pair(made=made, original=original)
@@ -62,7 +62,7 @@ def _written(content: bytes, read: Callable[[], Image.Image], out: Path) -> str 
     if not (out / name).is_file():
         try:
             image = read()
-        except UnitError:
+        except SampleError:
             return None
         unfinished = (out / name).with_suffix(".unfinished")
         unfinished.parent.mkdir(parents=True, exist_ok=True)

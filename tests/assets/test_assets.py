@@ -72,14 +72,14 @@ def test_networks_were_trained_alike_and_as_the_rule_demands(path):
 def test_every_release_that_must_be_served_is_served(public):
     served = [Undefended(), *(Affine(dim=dim) for dim in (2, 4, 8, 16))]
     served += [LDP(epsilon=epsilon, subset_size=m) for epsilon in (8.0, 10.0, 16.0) for m in (1, 2, 3, 4)]
-    assert [DIA().inapplicable(defense, Sift(), public) for defense in served] == [None] * len(served)
-    assert "no adapted attacker" in (DIA().inapplicable(LDP(epsilon=20), Sift(), public) or "")
+    assert [DIA().explain_not_applicable(defense, Sift(), public) for defense in served] == [None] * len(served)
+    assert "no adapted attacker" in (DIA().explain_not_applicable(LDP(epsilon=20), Sift(), public) or "")
 
 
 def test_oriented_descriptors_have_an_attacker_of_their_own(public):
     """The network for upright ones paints them far worse, and is not used (control)."""
     oriented = Sift(upright=False)
-    assert "no adapted attacker" in (DIA().inapplicable(LDP(), oriented, public) or "")
+    assert "no adapted attacker" in (DIA().explain_not_applicable(LDP(), oriented, public) or "")
     images = [source.path for source in photographs.builtin()[:3]]
     shown = [record["metrics"]["ssim"] for record in bench.run([Undefended()], [DIA()], images, extractor=oriented)]
     upright = weights.load(ASSETS / "inversion-none.safetensors")

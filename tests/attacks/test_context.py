@@ -257,7 +257,7 @@ def test_order_carries_nothing_and_it_repeats(public, secret):
 
 
 def test_applies_where_it_was_trained_for(public, tmp_path):
-    assert Context().inapplicable(LDP(), Sift(), public) is None
+    assert Context().explain_not_applicable(LDP(), Sift(), public) is None
     for defense, reason in (
         (LDP(epsilon=20), "epsilon"),
         (LDP(subset_size=5), "subset_size"),
@@ -265,10 +265,10 @@ def test_applies_where_it_was_trained_for(public, tmp_path):
         (LDP(dictionary=small_dictionary(tmp_path)), "dictionary"),
         (NaiveLDP(), "trained for ldp"),
     ):
-        told = Context().inapplicable(defense, Sift(), public)
+        told = Context().explain_not_applicable(defense, Sift(), public)
         assert "no adapted attacker" in (told or "")
         assert reason in (told or "")
-    assert "upright" in (Context().inapplicable(LDP(), Sift(upright=False), public) or "")
+    assert "upright" in (Context().explain_not_applicable(LDP(), Sift(upright=False), public) or "")
 
 
 def test_the_shipped_network_keeps_the_rules(public, shared_data):
@@ -329,7 +329,7 @@ def test_lessons_are_crops_under_settings_that_are_served(tmp_path):
     features = example_features(200)
     large = dataclasses.replace(features, keypoints=features.keypoints * 1.25, size=(320, 320))
     view = PhotographView("made-up", np.zeros((320, 320, 3), np.uint8), large)
-    served = {field: LDP.serves[field] for field in ("epsilon", "subset_size")}
+    served = {field: LDP.supported_settings[field] for field in ("epsilon", "subset_size")}
     draw = lessons([view], defense, served, "subset_size", Public(), 4, 3)
     drawn = [draw(np.random.default_rng(seed)) for seed in range(8)]
     assert {taught.scene.candidates.shape[1] for taught in drawn} == {1, 2, 3, 4}

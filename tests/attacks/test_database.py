@@ -216,10 +216,10 @@ def test_no_keypoints(rng):
 
 
 def test_where_no_word_is_led_through_it_does_not_apply():
-    reason = Database().inapplicable(Affine(lifting="random"), Sift(), Public())
+    reason = Database().explain_not_applicable(Affine(lifting="random"), Sift(), Public())
     assert reason is not None
     assert "no word" in reason
-    assert Database().inapplicable(Affine(), Sift(), Public()) is None
+    assert Database().explain_not_applicable(Affine(), Sift(), Public()) is None
 
 
 def test_subspaces_that_say_nothing_of_words_are_not_attacked():
@@ -232,4 +232,4 @@ def test_subspaces_that_say_nothing_of_words_are_not_attacked():
         def privacy(self, public: Public) -> Privacy:
             return Privacy("none")
 
-    assert "does not say" in str(Database().inapplicable(Plain(), Sift(), Public()))
+    assert "does not say" in str(Database().explain_not_applicable(Plain(), Sift(), Public()))

@@ -13,9 +13,9 @@ from bench.core.randomness import randomness
 from bench.extractors.sift import Sift
 from bench.images import photographs
 from bench.registry import discovery, spec
-from bench.runner.other_releases import Population
+from bench.runner.other_releases import OtherReleases
 from bench.tasks.reconstruction import RELEASES, Reconstruction, view
-from bench.testing import NO_UNIT, shot
+from bench.testing import NO_SAMPLE, shot
 from bench.types import Features, Floats, Knowledge, Release, Subspaces
 from defenses.affine import Affine
 from defenses.ldp import LDP
@@ -45,14 +45,14 @@ def secret() -> Features:
 def trial(attack: Attack, defense: Affine | LDP, secret: Features, others: int | None = None) -> Trial:
     """An attack on one release; `others` limits how many releases of other photographs there are."""
     public = Public()
-    population = Population(photographs.builtin()[1:4], Sift(max_keypoints=400), defense, public, randomness)
+    population = OtherReleases(photographs.builtin()[1:4], Sift(max_keypoints=400), defense, public, randomness)
 
     def strangers(count: int) -> Iterator[Release]:
         return population.without("astronaut")(count if others is None else min(count, others))
 
     return Trial(
-        unit=NO_UNIT,
-        shots=(shot(secret, defense.protect(secret, public, np.random.default_rng(1))),),
+        sample=NO_SAMPLE,
+        images=(shot(secret, defense.protect(secret, public, np.random.default_rng(1))),),
         defense=defense,
         attack=attack,
         extractor=Sift(),
@@ -95,7 +95,7 @@ def on_subspaces() -> list[type[Attack]]:
 def test_the_basis_that_was_drawn_says_nothing(plugin, database, secret):
     defense = Affine(dim=4, database=database, sub_databases=SUB_DATABASES)
     attack = spec.build(plugin, {})
-    assert Reconstruction().inapplicable(defense, attack, Sift(), Public()) is None
+    assert Reconstruction().explain_not_applicable(defense, attack, Sift(), Public()) is None
     first = trial(attack, defense, secret)
     rng = np.random.default_rng(5)
     repeats = tuple(rewritten(release, rng) for release in first.repeats)

@@ -156,5 +156,5 @@ def test_applies_where_descriptors_are_declared_to_be_8_bit():
     class Real(Sift):
         eight_bit = False
 
-    assert Lattice().inapplicable(Affine(), Sift(), Public()) is None
-    assert "8-bit" in (Lattice().inapplicable(Affine(), Real(), Public()) or "")
+    assert Lattice().explain_not_applicable(Affine(), Sift(), Public()) is None
+    assert "8-bit" in (Lattice().explain_not_applicable(Affine(), Real(), Public()) or "")

@@ -176,8 +176,10 @@ def test_applies_where_zeros_are_declared():
     class Dense(Sift):
         exact_zeros = False
 
-    assert Sparsity().inapplicable(Affine(), Sift(), Public()) is None
-    assert "exact zeros; dense" in (Sparsity().inapplicable(Affine(), Dense(), Public()) or "").replace("test-sparsity", "dense")
+    assert Sparsity().explain_not_applicable(Affine(), Sift(), Public()) is None
+    assert "exact zeros; dense" in (Sparsity().explain_not_applicable(Affine(), Dense(), Public()) or "").replace(
+        "test-sparsity", "dense"
+    )
 
 
 def test_refuses_no_pivots():

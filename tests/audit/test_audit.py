@@ -166,7 +166,7 @@ def test_what_is_remembered_counts_once_a_call(tmp_path: Path) -> None:
 class Secretive(LDP):
     """Remembers, and claims what one that forgets may claim."""
 
-    def remembers(self) -> bool:
+    def is_memoized(self) -> bool:
         return False
 
     def privacy(self, public: Public) -> Privacy:

@@ -72,7 +72,7 @@ def guessed(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return calls
 
 
-def numbers() -> store.Made:
+def numbers() -> store.Content:
     return {"numbers": np.arange(1000)}, {"of": "numbers"}
 
 

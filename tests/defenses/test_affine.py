@@ -11,7 +11,7 @@ from scipy import stats
 from bench.api import Asset, Privacy
 from bench.codebook import dictionary
 from bench.codebook.public import Public
-from bench.core.errors import UnitError, UserError
+from bench.core.errors import SampleError, UserError
 from bench.geometry.nearest_words import unit_rows
 from bench.testing import same
 from bench.types import Features
@@ -63,7 +63,7 @@ def test_the_descriptor_and_words_of_one_sub_database_lie_in_d(tmp_path: Path, l
     words = make_words()
     secret = make_features(30)
     defense = AFFINE(lifting=lifting, dim=dim, database=make_database(tmp_path, words))
-    lifted = defense.lifted(secret, Public(), np.random.default_rng(dim))
+    lifted = defense.lift(secret, Public(), np.random.default_rng(dim))
     release = lifted.release
     assert same(release, defense.protect(secret, Public(), np.random.default_rng(dim)))
     assert (release.origins.dtype, release.bases.dtype) == (np.float32, np.float32)
@@ -226,7 +226,7 @@ def test_a_word_that_is_the_descriptor_is_never_drawn() -> None:
 def test_a_database_of_nothing_else_is_a_failed_unit() -> None:
     secret = make_features(1)
     assert secret.codes is not None
-    with pytest.raises(UnitError, match="every draw of 2 words"):
+    with pytest.raises(SampleError, match="every draw of 2 words"):
         lift(secret.descriptors.astype(float), np.repeat(secret.codes, 5, axis=0), 2, 4, np.random.default_rng(0))
 
 
@@ -295,6 +295,6 @@ def test_a_database_that_does_not_do(tmp_path: Path) -> None:
 
 
 def test_an_attacker_is_trained_for_what_is_served() -> None:
-    for dim in AFFINE.serves["dim"].values:  # type: ignore[union-attr]
+    for dim in AFFINE.supported_settings["dim"].values:  # type: ignore[union-attr]
         AFFINE(dim=dim)
-    assert 3 not in AFFINE.serves["dim"]
+    assert 3 not in AFFINE.supported_settings["dim"]

@@ -598,10 +598,10 @@ def test_floats_without_codes_are_quantised_too(tmp_path: Path) -> None:
 def test_an_attacker_is_trained_for_what_is_served() -> None:
     rng = np.random.default_rng(0)
     for _ in range(20):
-        LDP(**{name: setting.sample(rng) for name, setting in LDP.serves.items()})
-    assert 12.0 in LDP.serves["epsilon"]
-    assert math.inf not in LDP.serves["epsilon"]
-    assert 5 not in LDP.serves["subset_size"]
+        LDP(**{name: setting.sample(rng) for name, setting in LDP.supported_settings.items()})
+    assert 12.0 in LDP.supported_settings["epsilon"]
+    assert math.inf not in LDP.supported_settings["epsilon"]
+    assert 5 not in LDP.supported_settings["subset_size"]
 
 
 # ---- memory
@@ -640,7 +640,7 @@ def test_what_is_remembered_has_the_law_of_the_mechanism(tmp_path: Path) -> None
 def test_a_defense_that_remembers_promises_something_else(tmp_path: Path) -> None:
     asset = make_dictionary(tmp_path, 300)
     remembering, forgetful = (LDP(dictionary=asset, memoize=memoize) for memoize in (True, False))
-    assert (remembering.remembers(), forgetful.remembers()) == (True, False)
+    assert (remembering.is_memoized(), forgetful.is_memoized()) == (True, False)
     assert remembering.privacy(Public()).guarantee == "epsilon-ldp-by-word"
     assert forgetful.privacy(Public()).guarantee == "epsilon-ldp"
 

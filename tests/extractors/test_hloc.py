@@ -12,7 +12,7 @@ from PIL import Image
 from attacks.lattice import Lattice
 from attacks.sparsity import Sparsity
 from bench.codebook.public import Public
-from bench.core.errors import UnitError, UserError
+from bench.core.errors import SampleError, UserError
 from bench.extractors.hloc import Hloc
 from bench.extractors.sift import Sift
 from bench.images import photographs
@@ -56,8 +56,8 @@ def extract(path: Path, photograph: Path, **more: Any) -> Any:
 def test_what_is_declared_of_the_descriptors_decides_which_attacks_apply(tmp_path: Path) -> None:
     path = features(tmp_path)
     for attack, declared in ((Sparsity(), {"exact_zeros": True}), (Lattice(), {"eight_bit": True})):
-        assert "hloc does not declare" in (attack.inapplicable(Affine(), Hloc(path=path), Public()) or "")
-        assert attack.inapplicable(Affine(), Hloc(path=path, **declared), Public()) is None
+        assert "hloc does not declare" in (attack.explain_not_applicable(Affine(), Hloc(path=path), Public()) or "")
+        assert attack.explain_not_applicable(Affine(), Hloc(path=path, **declared), Public()) is None
 
 
 def test_keypoints_follow_the_cut_and_the_scale(tmp_path: Path, photograph: Path) -> None:
@@ -112,7 +112,7 @@ def test_longest_end_of_the_path_names_the_group(tmp_path: Path, photograph: Pat
 )
 def test_bad_features_are_explained(tmp_path: Path, photograph: Path, datasets: dict[str, Any], complaint: str) -> None:
     path = features(tmp_path, **datasets)
-    with pytest.raises(UnitError, match=complaint):
+    with pytest.raises(SampleError, match=complaint):
         extract(path, photograph)
 
 
@@ -125,7 +125,7 @@ def test_rotated_photograph_is_refused(tmp_path: Path) -> None:
     exif = Image.Exif()
     exif[0x0112] = 3
     texture(0, (WIDTH, HEIGHT)).save(tmp_path / "a.png", exif=exif)
-    with pytest.raises(UnitError, match="EXIF rotation"):
+    with pytest.raises(SampleError, match="EXIF rotation"):
         extract(features(tmp_path, "a.png"), tmp_path / "a.png")
 
 

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from bench.core.errors import UnitError, UserError
+from bench.core.errors import SampleError, UserError
 from bench.extractors.sift import Sift
 from bench.images import photographs
 
@@ -77,7 +77,7 @@ def test_the_strongest_are_kept(images):
 
 
 def test_a_flat_image_has_none():
-    with pytest.raises(UnitError, match="no keypoint"):
+    with pytest.raises(SampleError, match="no keypoint"):
         Sift().extract(np.full((256, 256, 3), 90, np.uint8))
 
 

@@ -14,7 +14,7 @@ from PIL import Image
 
 from bench import cli
 from bench.codebook.examples import small_dictionary
-from bench.core.errors import UnitError, UserError
+from bench.core.errors import SampleError, UserError
 from bench.extractors.colmap_database import ColmapDatabase
 from bench.extractors.hardnet import WEIGHTS, HardNet
 from bench.extractors.hloc import Hloc
@@ -160,10 +160,10 @@ def test_databases_that_cannot_serve(images: Path, tmp_path: Path) -> None:
     assert export("--images", images, "--layout", "colmap", "--out", out) == 0
     stranger = tmp_path / "stranger.png"
     texture(9, (300, 200)).save(stranger)
-    with pytest.raises(UnitError, match="no image of that name"):
+    with pytest.raises(SampleError, match="no image of that name"):
         ColmapDatabase(path=out).extract(photographs.read(stranger).pixels, stranger)
     texture(9, (100, 200)).save(images / "b.png")
-    with pytest.raises(UnitError, match="the photograph has"):
+    with pytest.raises(SampleError, match="the photograph has"):
         ColmapDatabase(path=out).extract(photographs.read(images / "b.png").pixels, images / "b.png")
     with pytest.raises(UserError, match="this one has none"):
         ColmapDatabase(path=out).extract(np.zeros((256, 256, 3), np.uint8))

@@ -12,7 +12,7 @@ from fakes import scene
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from bench.core.errors import UnitError, UserError
+from bench.core.errors import SampleError, UserError
 from bench.datasets import aachen, colmap
 from bench.formats import lists, nvm, scene_export
 from bench.images.scene import Scene, SceneImage
@@ -156,7 +156,7 @@ def test_images_are_read_as_they_are_stored_and_must_have_the_camera_s_size(here
     found = colmap.load(here["colmap"]).references[0]
     np.testing.assert_array_equal(found.pixels.read(), before)
     Image.fromarray(before[:50]).save(path)
-    with pytest.raises(UnitError, match=r"0\.png: 80 x 50 pixels; its camera says 80 x 64"):
+    with pytest.raises(SampleError, match=r"0\.png: 80 x 50 pixels; its camera says 80 x 64"):
         found.pixels.read()
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from bench.runner.records import FILE, SCHEMA, cell_id, run_hash
+from bench.runner.records import FILE, SCHEMA, experiment_id, run_hash
 
 SIFT = {"name": "sift", "upright": True, "max_keypoints": 1000}
 ENVIRONMENT = {"version": "0.1.0", "source": "sha256:" + "5" * 64, "torch": "2.14", "device": "cpu", "threads": 2}
@@ -41,7 +41,7 @@ def record(
     **more: Any,
 ) -> dict[str, Any]:
     """One record, as the runner writes it."""
-    cell = cell_id({"name": task, **task_settings}, defense, attack, dataset, seed, settings)
+    cell = experiment_id({"name": task, **task_settings}, defense, attack, dataset, seed, settings)
     epsilon = defense.get("epsilon")
     keypoints = metrics.get("keypoints", 100) if status == "ok" else None
     return {

@@ -13,7 +13,7 @@ from bench.api import Defense, Trial
 from bench.codebook.public import Public
 from bench.extractors.sift import Sift
 from bench.images.scene import File, Reference, Scene, SceneImage
-from bench.testing import NO_UNIT, shot
+from bench.testing import NO_SAMPLE, shot
 from bench.types import Features, Release
 
 FAKES = {
@@ -78,8 +78,8 @@ def trial(defense: Defense, secret: Features, *, rng: np.random.Generator | None
     """A trial of a task that judges the release itself, of features without a photograph."""
     public = Public()
     return Trial(
-        unit=NO_UNIT,
-        shots=(shot(secret, defense.protect(secret, public, np.random.default_rng(1))),),
+        sample=NO_SAMPLE,
+        images=(shot(secret, defense.protect(secret, public, np.random.default_rng(1))),),
         defense=defense,
         attack=None,
         extractor=Sift(),

@@ -7,7 +7,7 @@ import pytest
 from fakes import album, texture
 from PIL import Image
 
-from bench.core.errors import UnitError, UserError
+from bench.core.errors import SampleError, UserError
 from bench.extractors.sift import Sift
 from bench.images import photographs
 
@@ -59,7 +59,7 @@ def test_square_is_cut_from_the_centre(tmp_path: Path) -> None:
 def test_truncated_jpeg(tmp_path: Path) -> None:
     path = save(tmp_path / "cut.jpg", texture(0))
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    with pytest.raises(UnitError, match=r"cut\.jpg: cannot be read as an image: (?i:.*truncated)"):
+    with pytest.raises(SampleError, match=r"cut\.jpg: cannot be read as an image: (?i:.*truncated)"):
         photographs.read(path)
 
 
@@ -67,18 +67,18 @@ def test_truncated_jpeg(tmp_path: Path) -> None:
 def test_file_that_is_no_image(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "false.png"
     path.write_bytes(content)
-    with pytest.raises(UnitError, match=r"false\.png: cannot be read as an image"):
+    with pytest.raises(SampleError, match=r"false\.png: cannot be read as an image"):
         photographs.read(path)
 
 
 def test_one_pixel(tmp_path: Path) -> None:
-    with pytest.raises(UnitError, match="1 x 1 pixels; at least 32 x 32 are needed"):
+    with pytest.raises(SampleError, match="1 x 1 pixels; at least 32 x 32 are needed"):
         photographs.read(save(tmp_path / "dot.png", Image.new("RGB", (1, 1))))
 
 
 def test_image_without_a_keypoint(tmp_path: Path) -> None:
     flat = photographs.read(save(tmp_path / "flat.png", Image.new("RGB", (64, 64), "grey")))
-    with pytest.raises(UnitError, match="no keypoint"):
+    with pytest.raises(SampleError, match="no keypoint"):
         Sift().extract(flat.pixels)
 
 

@@ -27,16 +27,16 @@ def _cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_queries_are_units_with_their_condition_and_the_whole_scene_counts() -> None:
-    collection = samples.of_queries(TINY)
-    assert [unit.condition for unit in collection.units] == ["day", "day", "night"]
-    assert len({unit.content_hash() for unit in collection.units}) == 3
-    other = samples.of_queries(dataclasses.replace(TINY, views=3))  # another map, and so another dataset
+    collection = samples.collect_queries(TINY)
+    assert [unit.condition for unit in collection.samples] == ["day", "day", "night"]
+    assert len({unit.content_hash() for unit in collection.samples}) == 3
+    other = samples.collect_queries(dataclasses.replace(TINY, views=3))  # another map, and so another dataset
     assert collection.beside != other.beside
 
 
 def test_a_task_of_photographs_refuses_a_place() -> None:
     with pytest.raises(UserError, match="takes no dataset"):
-        Collisions().collection(None, TINY)
+        Collisions().collect(None, TINY)
 
 
 class Counted(Pixels):
@@ -102,4 +102,4 @@ def test_a_scene_without_queries_is_a_mistake(tmp_path: Path, monkeypatch: pytes
     bare: Scene = dataclasses.replace(scene(tmp_path / "scene"), queries=())
     monkeypatch.setattr(Gallery, "scene", lambda self: bare)
     with pytest.raises(UserError, match="has no queries"):
-        samples.of_queries(TINY)
+        samples.collect_queries(TINY)

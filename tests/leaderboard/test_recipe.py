@@ -18,7 +18,7 @@ from bench.datasets.gallery import Gallery
 from bench.extractors.sift import Sift
 from bench.registry import discovery, spec
 from bench.runner import plan as runner
-from bench.runner.plan import Asked, Plan
+from bench.runner.plan import Plan, RunConfiguration
 from bench.tasks.collisions import Collisions
 from bench.tasks.localization import Localization
 from bench.tasks.reconstruction import Reconstruction
@@ -38,7 +38,9 @@ def planned(command: str) -> Plan:
     pairs = tuple((defense, attack) for defense in defenses for attack in attacks or [None])
     extractor: Extractor = spec.read(args.extractor, discovery.EXTRACTOR)
     dataset = None if args.dataset is None else spec.read(args.dataset, discovery.DATASET)
-    return runner.planned(Asked(pairs=pairs, images=args.images, task=task, extractor=extractor, dataset=dataset, seed=args.seed))
+    return runner.planned(
+        RunConfiguration(pairs=pairs, images=args.images, task=task, extractor=extractor, dataset=dataset, seed=args.seed)
+    )
 
 
 def written(plan: Plan) -> list[Cell]:
@@ -67,7 +69,9 @@ def test_the_command_is_the_cell(
     album(tmp_path / "my album")
     monkeypatch.chdir(tmp_path)
     pairs = ((spec.read(defense, discovery.DEFENSE), spec.read(attack, discovery.ATTACK)),)
-    asked = Asked(pairs=pairs, images=Path("my album"), task=Reconstruction(), extractor=extractor, dataset=None, seed=7)
+    asked = RunConfiguration(
+        pairs=pairs, images=Path("my album"), task=Reconstruction(), extractor=extractor, dataset=None, seed=7
+    )
     plan = runner.planned(asked)
     (cell,) = written(plan)
     command = recipe(cell).command
@@ -75,7 +79,7 @@ def test_the_command_is_the_cell(
 
 
 def test_what_is_as_by_default_is_not_spelt_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = Asked(
+    asked = RunConfiguration(
         pairs=((spec.read("affine", discovery.DEFENSE), None),),
         images=None,
         task=Collisions(),
@@ -92,7 +96,7 @@ def test_words_of_a_place_are_made_there_again() -> None:
     tiny = Gallery(width=64, height=48, detail=0.1, views=2, queries=2)
     ldp = spec.read("ldp:epsilon=9,words=32,dictionary=references", discovery.DEFENSE)
     task = Localization(retrieval="released", trials=100)
-    plan = runner.planned(Asked(pairs=((ldp, None),), images=None, task=task, extractor=Sift(), dataset=tiny, seed=1))
+    plan = runner.planned(RunConfiguration(pairs=((ldp, None),), images=None, task=task, extractor=Sift(), dataset=tiny, seed=1))
     (cell,) = written(plan)
     found = recipe(cell)
     assert found.command == (
@@ -108,7 +112,9 @@ def test_files_of_ones_own_are_named_by_their_digest(tmp_path: Path, monkeypatch
     album(tmp_path / "album")
     monkeypatch.chdir(tmp_path)
     pairs = ((spec.read(f"ldp:epsilon=5,dictionary={own}", discovery.DEFENSE), spec.read("keypoints", discovery.ATTACK)),)
-    plan = runner.planned(Asked(pairs=pairs, images=Path("album"), task=Reconstruction(), extractor=Sift(), dataset=None, seed=0))
+    plan = runner.planned(
+        RunConfiguration(pairs=pairs, images=Path("album"), task=Reconstruction(), extractor=Sift(), dataset=None, seed=0)
+    )
     (cell,) = written(plan)
     found = recipe(cell)
     assert found.command == "bench run --defense ldp:epsilon=5,dictionary=FILE --attack keypoints --images album --seed 0"

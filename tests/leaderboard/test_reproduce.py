@@ -116,7 +116,7 @@ def unanswered(setting: Setting) -> dict[str, str | None]:
     """Rows of tables about photographs that no attack as configured answers -> why."""
     public = Public()
     every = [row for table in tables.everything().values() if not table.place for row in table.rows(setting)]
-    reasons = {row.name: row.task.inapplicable(row.defense, row.attack, setting.extractor, public) for row in every}
+    reasons = {row.name: row.task.explain_not_applicable(row.defense, row.attack, setting.extractor, public) for row in every}
     return {name: reason for name, reason in reasons.items() if reason is not None}
 
 

@@ -9,8 +9,8 @@ import fabricated
 import pytest
 from fabricated import DIA, ENVIRONMENT, PHOTOGRAPHS, SETTINGS, inapplicable, ldp, localizations, paint, reconstructions
 
-from bench.runner.directory import picture
-from bench.runner.records import cell_id
+from bench.runner.directory import reconstruction_path
+from bench.runner.records import experiment_id
 from leaderboard import site
 from leaderboard.run_report import photograph
 
@@ -56,7 +56,7 @@ def results(folder: Path) -> Path:
         *localizations({"name": "new"}, [0] * 8, DAYS),
     ]
     for number, record in enumerate(reconstructed):
-        paint(picture(folder, record), number)
+        paint(reconstruction_path(folder, record), number)
         if record["unit"] != "2.png":  # of which the photograph has gone
             paint(photograph(folder, record), 1000 + int(record["unit"][0]))
     return fabricated.write(folder, [*reconstructed, *others])
@@ -340,10 +340,10 @@ def test_names_of_records_lead_to_no_other_files(tmp_path: Path) -> None:
     record["unit"] = "../../../secret"
     folder = fabricated.write(tmp_path / "runs", [record])
     (folder / "reconstructions" / record["cell_id"]).mkdir(parents=True)
-    assert picture(folder, record).resolve() == secret
+    assert reconstruction_path(folder, record).resolve() == secret
     written = site.write(folder, tmp_path / "site").page
     assert not (written.parent / "pictures").exists()
-    assert record["cell_id"] == cell_id({"name": "reconstruction"}, NONE, DIA, PHOTOGRAPHS, 0, SETTINGS)
+    assert record["cell_id"] == experiment_id({"name": "reconstruction"}, NONE, DIA, PHOTOGRAPHS, 0, SETTINGS)
 
 
 def test_it_is_written_alike_again(tmp_path: Path) -> None:

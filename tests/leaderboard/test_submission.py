@@ -22,7 +22,7 @@ from bench.extractors.sift import Sift
 from bench.localization.scene_index import Place
 from bench.localization.server import Server
 from bench.runner import records
-from bench.runner.attack_process import isolated
+from bench.runner.attack_process import execute_in_attack_process
 from bench.tasks.reconstruction import Reconstruction
 from bench.types import Knowledge, Subspaces
 from defenses.affine import Affine
@@ -102,7 +102,7 @@ def hashed_again(record: dict[str, Any]) -> None:
     """As someone who lies with care would."""
     task = {"name": record["task"], **record["task_settings"]}
     parts = (task, record["defense"], record["attack"], record["dataset"], record["seed"], record["metric_settings"])
-    record["cell_id"] = records.cell_id(*parts)
+    record["cell_id"] = records.experiment_id(*parts)
     record["run_hash"] = records.run_hash(record["cell_id"], record["environment"])
 
 
@@ -242,7 +242,7 @@ def test_the_other_process_does_as_this_one() -> None:
     needs = frozenset({Knowledge.OTHER_RELEASES, Knowledge.PUBLIC_DATABASE})
     here, there = seen(needs), seen(needs)
     one, other = np.random.default_rng(3), np.random.default_rng(3)
-    assert np.array_equal(isolated(summed, there, other), summed(here, one))
+    assert np.array_equal(execute_in_attack_process(summed, there, other), summed(here, one))
     assert here.notes == there.notes == ["a database", "this attack did not declare DATABASE in its `needs`"]
     assert one.random() == other.random()
 
@@ -261,10 +261,10 @@ def test_the_map_comes_without_the_queries(tmp_path: Path) -> None:
     asked = seen(frozenset())
     served = Server(public=public, camera=whole.queries[0].camera)
     asked = dataclasses.replace(asked, knowledge={Knowledge.MAP: lambda: served})
-    found = isolated(camera_and_references, asked, np.random.default_rng(0))
+    found = execute_in_attack_process(camera_and_references, asked, np.random.default_rng(0))
     assert found.tolist() == [np.float32(75.1), len(whole.references), 1]
 
 
 def test_errors_come_back() -> None:
     with pytest.raises(RuntimeError, match="lost count"):
-        isolated(broken, seen(frozenset()), np.random.default_rng(0))
+        execute_in_attack_process(broken, seen(frozenset()), np.random.default_rng(0))

@@ -127,7 +127,7 @@ def test_subspace_to_subspace(seen: Map, retrieved: Retrieved, rng: np.random.Ge
         rows = seen.rows(reference)
         return replace(theirs, keypoints=theirs.keypoints[rows], origins=theirs.origins[rows], bases=theirs.bases[rows])
 
-    found = SubspaceToSubspace().match(release, replace(retrieved, lifted=lifted))
+    found = SubspaceToSubspace().match(release, replace(retrieved, lift=lifted))
     assert pairs(found) == loops(apart, list(range(10)), retrieved, 1.0)
     check_rows(found, retrieved)
     with pytest.raises(TypeError, match="subspace-to-subspace needs a release of subspaces, and references that are lifted"):
@@ -174,9 +174,12 @@ def test_matcher_is_chosen_by_type() -> None:
         Affine(): "point-to-subspace",
     }
     assert {defense: map_matching.default(defense) for defense in chosen} == chosen
-    assert map_matching.inapplicable("mutual-nn", LDP()) is None
-    assert map_matching.inapplicable("vocabulary", Affine()) == "vocabulary matches WordSets; affine releases Subspaces"
-    assert map_matching.inapplicable("vocabulary", NaiveLDP()) == "vocabulary matches words of a dictionary; naive-ldp has none"
+    assert map_matching.explain_not_applicable("mutual-nn", LDP()) is None
+    assert map_matching.explain_not_applicable("vocabulary", Affine()) == "vocabulary matches WordSets; affine releases Subspaces"
+    assert (
+        map_matching.explain_not_applicable("vocabulary", NaiveLDP())
+        == "vocabulary matches words of a dictionary; naive-ldp has none"
+    )
 
 
 def test_release_of_another_type_is_refused(seen: Map, retrieved: Retrieved, rng: np.random.Generator) -> None:

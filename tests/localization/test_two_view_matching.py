@@ -122,8 +122,8 @@ def judged(task: Matching, defense: Defense, secrets: tuple[Features, Features],
     other = shot(secrets[1], released(defense, secrets[1], seed=5))
     nowhere = File(path=Path("none"), size=(1, 1))
     pair = Pair(name="pair", first=nowhere, second=nowhere, homography=homography)
-    unit = replace(made.unit, subject=pair)
-    return task.judge(replace(made, unit=unit, shots=(*made.shots, other)))
+    unit = replace(made.sample, subject=pair)
+    return task.evaluate(replace(made, sample=unit, images=(*made.images, other)))
 
 
 def seen_again(homography: np.ndarray) -> tuple[Features, Features]:
@@ -176,6 +176,6 @@ def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
         with pytest.raises(UserError, match="must be"):
             Matching(**wrong)
     with pytest.raises(UserError, match="no sequence of HPatches"):
-        Matching().collection(tmp_path, None)
+        Matching().collect(tmp_path, None)
     with pytest.raises(UserError, match="give a folder of HPatches"):
-        Matching().collection([tmp_path], None)
+        Matching().collect([tmp_path], None)

@@ -78,7 +78,7 @@ def test_it_keeps_the_contract_of_metrics(weights: Path) -> None:
 def test_its_settings_are_the_weights_by_content(weights: Path, tmp_path: Path) -> None:
     album(tmp_path / "album", 1)
     plan = runner.planned(
-        runner.Asked(
+        runner.RunConfiguration(
             pairs=((Undefended(), Painter()),),
             images=tmp_path / "album",
             task=spec.read("reconstruction", discovery.TASK),

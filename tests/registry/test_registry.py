@@ -118,7 +118,7 @@ def test_attack_must_not_decide_applicability_itself() -> None:
     def inapplicable(self: Any, defense: Any, extractor: Any, public: Any) -> None: ...
     def reconstruct(self: Any, view: Any, rng: Any) -> None: ...
 
-    wrong = frozen(ImageAttack, accepts=(Descriptors,), reconstruct=reconstruct, inapplicable=inapplicable)
+    wrong = frozen(ImageAttack, accepts=(Descriptors,), reconstruct=reconstruct, explain_not_applicable=inapplicable)
     with pytest.raises(UserError, match="must not override inapplicable"):
         discovery.check(discovery.ATTACK, wrong)
 

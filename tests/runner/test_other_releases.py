@@ -11,7 +11,7 @@ from bench.core import randomness as seeds
 from bench.extractors.sift import Sift
 from bench.geometry.nearest_words import unit_rows
 from bench.images.photographs import Source, folder
-from bench.runner.other_releases import Population, window
+from bench.runner.other_releases import OtherReleases, random_window
 from defenses.none import Undefended
 
 
@@ -24,13 +24,13 @@ def sources(tmp_path: Path) -> list[Source]:
     return folder(album(tmp_path / "album", 3))
 
 
-def population(sources: list[Source]) -> Population:
-    return Population(sources, Sift(), Undefended(), Public(), randomness)
+def population(sources: list[Source]) -> OtherReleases:
+    return OtherReleases(sources, Sift(), Undefended(), Public(), randomness)
 
 
 def similarity(release, source: Source) -> float:
     """How much of a release is seen, mirrored or not, in a photograph at its own size: mean greatest cosine."""
-    seen = [Sift().extract(window(source, np.random.default_rng(seed))).descriptors for seed in range(8)]
+    seen = [Sift().extract(random_window(source, np.random.default_rng(seed))).descriptors for seed in range(8)]
     return float((unit_rows(release.descriptors) @ np.concatenate(seen).T).max(axis=1).mean())
 
 
@@ -69,6 +69,6 @@ def test_photographs_that_cannot_be_read_are_passed_over(sources, tmp_path) -> N
 
 
 def test_windows_are_squares_of_the_photograph(sources) -> None:
-    assert all(window(sources[0], np.random.default_rng(seed)).shape == (256, 256, 3) for seed in range(4))
-    first, second = (window(sources[0], np.random.default_rng(seed)) for seed in (0, 1))
+    assert all(random_window(sources[0], np.random.default_rng(seed)).shape == (256, 256, 3) for seed in range(4))
+    first, second = (random_window(sources[0], np.random.default_rng(seed)) for seed in (0, 1))
     assert not np.array_equal(first, second)

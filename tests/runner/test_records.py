@@ -111,7 +111,7 @@ def test_reader_is_told_of_a_lost_line(tmp_path: Path, caplog: pytest.LogCapture
 
 def test_cell_does_not_depend_on_the_name_of_the_folder_or_the_order_of_keys() -> None:
     def cell(**dataset: Any) -> str:
-        return records.cell_id("t", {"name": "ldp", "epsilon": 1.0}, None, dataset, 0, {})
+        return records.experiment_id("t", {"name": "ldp", "epsilon": 1.0}, None, dataset, 0, {})
 
     assert cell(name="a", hash="1") == cell(hash="1", name="b")
     assert cell(hash="1") != cell(hash="2")

@@ -138,8 +138,8 @@ def test_release_depends_on_neither_attack_order_nor_company(images: Path, small
 
 def test_releases_that_are_done_with_are_let_go_of_at_once(images: Path, small: Asset) -> None:
     plan = runner.prepare([LDP(dictionary=small)], [Painter()], images, task=PAINT)
-    trials, (cell,), unit = Trials(plan), plan.cells, plan.units[0]
-    release = weakref.ref(trials.trial(cell, unit).shots[0].release)
+    trials, (cell,), unit = Trials(plan), plan.experiments, plan.samples[0]
+    release = weakref.ref(trials.trial(cell, unit).images[0].release)
     gc.disable()
     try:
         assert release() is not None  # for the next attack on it
@@ -147,7 +147,7 @@ def test_releases_that_are_done_with_are_let_go_of_at_once(images: Path, small: 
         assert release() is None
     finally:
         gc.enable()
-    assert trials.carry_out(cell, unit).record["status"] == "ok"
+    assert trials.execute(cell, unit).record["status"] == "ok"
 
 
 def test_all_attacks_see_the_same_release(images: Path, small: Asset, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -296,7 +296,7 @@ def test_finished_run_is_not_done_again(images: Path, small: Asset, tmp_path: Pa
     assert run(*grid, out=tmp_path / "out") == first
     assert (tmp_path / "out" / FILE).read_bytes() == before
     for record in first:
-        assert directory.picture(tmp_path / "out", record).is_file() == (record["status"] == "ok")
+        assert directory.reconstruction_path(tmp_path / "out", record).is_file() == (record["status"] == "ok")
 
 
 def test_interrupted_run_goes_on_and_ends_as_if_it_had_not_been(images: Path, small: Asset, tmp_path: Path) -> None:
@@ -324,7 +324,7 @@ def test_failed_units_are_tried_again(images: Path, tmp_path: Path, monkeypatch:
 
 def test_changed_photograph_or_setting_is_another_cell(images: Path) -> None:
     def cell(**more: Any) -> str:
-        return runner.prepare([Undefended()], [Painter()], images, task=PAINT, **more).cells[0].head["cell_id"]
+        return runner.prepare([Undefended()], [Painter()], images, task=PAINT, **more).experiments[0].metadata["cell_id"]
 
     first = cell()
     assert cell() == first
@@ -386,15 +386,15 @@ def test_a_device_that_remembers_gives_one_answer_in_all_photographs(images: Pat
 
 def test_processes_make_the_same_records(images: Path, small: Asset, tmp_path: Path) -> None:
     (images / "bad.jpg").write_bytes(b"no photograph")
-    engine = engines.choose(workers=2)
+    engine = engines.choose_engine(workers=2)
     plan = runner.prepare([LDP(epsilon=8, dictionary=small), Undefended()], [Painter(), Guess()], images, task=PAINT)
-    alone = runner.in_order([plan], runner.execute([plan], tmp_path / "alone"))
+    alone = runner.sort_records([plan], runner.execute([plan], tmp_path / "alone"))
     together: Iterator[Record] = runner.execute([plan], tmp_path / "together", engine)
     next(together)
     next(together)
     together.close()  # interrupted after a record  # type: ignore[attr-defined]
     resumed = list(runner.execute([plan], tmp_path / "together", engine))
-    assert judged(runner.in_order([plan], resumed)) == judged(alone)
+    assert judged(runner.sort_records([plan], resumed)) == judged(alone)
     assert sum(record["status"] != "failed" for record in written(tmp_path / "together")) == len(alone) - 3  # none twice
     pictures = {path.relative_to(tmp_path / "alone"): path.read_bytes() for path in (tmp_path / "alone").rglob("*.png")}
     assert pictures == {

@@ -120,11 +120,11 @@ def test_every_suite_of_ours_can_be_planned() -> None:
 def test_privacy_and_utility_are_told_of_the_same_queries_and_defenses() -> None:
     few = Gallery(views=2, queries=1, night=0.0, width=64, height=48, detail=0.1)
     attacked, served = (
-        [cell for cell in runner.planned(replace(part, dataset=few)).cells if cell.reason is None]
+        [cell for cell in runner.planned(replace(part, dataset=few)).experiments if cell.reason is None]
         for part in suite.find("privacy-utility").parts
     )
-    assert [{cell.head["task"] for cell in cells} for cells in (attacked, served)] == [{"reconstruction"}, {"localization"}]
-    assert len({cell.head["dataset"]["hash"] for cell in (*attacked, *served)}) == 1
+    assert [{cell.metadata["task"] for cell in cells} for cells in (attacked, served)] == [{"reconstruction"}, {"localization"}]
+    assert len({cell.metadata["dataset"]["hash"] for cell in (*attacked, *served)}) == 1
     adapted = [cell.defense for cell in attacked if isinstance(cell.attack, DIA)]
     assert adapted == [cell.defense for cell in served]
 
@@ -167,7 +167,7 @@ def test_sweep_of_a_suite_of_ones_own_and_again(mine: str, capfd: pytest.Capture
 
 
 def test_engines_are_chosen_with_what_they_need() -> None:
-    assert engines.choose() is engines.HERE
+    assert engines.choose_engine() is engines.IN_PROCESS
     for asked, complaint in [
         ((0,), "--workers must be at least 1"),
         ((1, "dusk"), "unknown engine 'dusk'; did you mean 'dask'"),
@@ -175,7 +175,7 @@ def test_engines_are_chosen_with_what_they_need() -> None:
         ((1, "processes", "tcp://x:1"), "--scheduler is for --engine dask"),
     ]:
         with pytest.raises(UserError, match=complaint):
-            engines.choose(*asked)
+            engines.choose_engine(*asked)
 
 
 def test_processes_share_the_cores(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -184,7 +184,7 @@ def test_processes_share_the_cores(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setenv(variable, "7")
     monkeypatch.setattr(threads, "cores", lambda: 4)
     threads.limit.cache_clear()
-    engine = engines.choose(2)
+    engine = engines.choose_engine(2)
     assert engine.describe([])["threads"] == 2
     assert {os.environ[variable] for variable in threads.VARIABLES} == {"2"}
     counted = "import numpy, torch, threadpoolctl; print({p['num_threads'] for p in threadpoolctl.threadpool_info()})"
@@ -193,7 +193,7 @@ def test_processes_share_the_cores(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_process_that_is_killed_stops_the_run_and_the_rest_is_done_next_time(images: Path, tmp_path: Path) -> None:
-    engine = engines.choose(2)
+    engine = engines.choose_engine(2)
     marker = tmp_path / "killed"
     plan = runner.prepare([Undefended()], [Painter(), Fatal(marker=str(marker))], images, task=PAINT)
     with pytest.raises(UserError, match=r"ended from outside.*run again to go on"):
@@ -221,16 +221,16 @@ def test_two_workers_one_of_them_killed(images: Path, small: Asset, tmp_path: Pa
     marker = tmp_path / "killed"
     attacks = [Painter(), Guess(), Fatal(marker=str(marker))]
     parts = grid(defenses=[LDP(epsilon=8, dictionary=small), Undefended()], attacks=attacks, tasks=[PAINT], images=images)
-    engine = engines.choose(kind="dask", scheduler=cluster.scheduler_address)
+    engine = engines.choose_engine(kind="dask", scheduler=cluster.scheduler_address)
     before = {worker.pid for worker in cluster.workers.values()}
     plans = [runner.prepared(part, engine.describe) for part in parts]
-    found = runner.in_order(plans, runner.execute(plans, tmp_path / "many", engine))
+    found = runner.sort_records(plans, runner.execute(plans, tmp_path / "many", engine))
     assert marker.exists()
     assert before != {worker.pid for worker in cluster.workers.values()}  # one of them is gone
     keys = [(record["run_hash"], record["unit"]) for record in lines(tmp_path / "many")]
     assert len(keys) == len(set(keys)) == len(plans[0])
     alone = [runner.prepared(part) for part in parts]
-    assert judged(found) == judged(runner.in_order(alone, runner.execute(alone, tmp_path / "one")))
+    assert judged(found) == judged(runner.sort_records(alone, runner.execute(alone, tmp_path / "one")))
     assert {record["status"] for record in found} == {"ok", "failed", "n/a"}
     assert pictures(tmp_path / "many") == pictures(tmp_path / "one") != {}
     assert {record["environment"]["threads"] for record in found} == {1}
@@ -239,17 +239,17 @@ def test_two_workers_one_of_them_killed(images: Path, small: Asset, tmp_path: Pa
 
 
 def test_what_kills_every_worker_is_a_failed_record(images: Path, tmp_path: Path, cluster: Any) -> None:
-    engine = engines.choose(kind="dask", scheduler=cluster.scheduler_address)
+    engine = engines.choose_engine(kind="dask", scheduler=cluster.scheduler_address)
     part = grid(defenses=[Undefended()], attacks=[Fatal(), Painter()], tasks=[PAINT], images=[images / "0.png"])[0]
     plan = runner.prepared(part, engine.describe)
-    fatal, painter = runner.in_order([plan], runner.execute([plan], tmp_path / "out", engine))
+    fatal, painter = runner.sort_records([plan], runner.execute([plan], tmp_path / "out", engine))
     assert (fatal["status"], painter["status"]) == ("failed", "ok")
     assert "every worker that began this ended" in fatal["reason"]
 
 
 def test_a_worker_with_other_files_is_refused(images: Path, tmp_path: Path, cluster: Any) -> None:
     """It would make other records."""
-    engine = engines.choose(kind="dask", scheduler=cluster.scheduler_address)
+    engine = engines.choose_engine(kind="dask", scheduler=cluster.scheduler_address)
     part = grid(defenses=[Undefended()], attacks=[Painter()], tasks=[PAINT], images=images)[0]
     plan = runner.prepared(part, engine.describe)
     album(images, 4)
@@ -263,7 +263,7 @@ def test_a_scheduler_that_is_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(module, "PATIENCE", 0.2)
     with pytest.raises(UserError, match="no scheduler answers there"):
-        engines.choose(kind="dask", scheduler="tcp://127.0.0.1:9").describe([])
+        engines.choose_engine(kind="dask", scheduler="tcp://127.0.0.1:9").describe([])
 
 
 # ---- what a folder tells
@@ -281,7 +281,7 @@ def test_status_from_nothing_to_the_end(plan: Plan, tmp_path: Path) -> None:
     running: Iterator[Record] = runner.execute([plan], out)
     next(running)  # what does not apply
     begun = status(out)
-    assert (begun.count, begun.inapplicable, begun.alive) == (Count(missing=9), 1, True)
+    assert (begun.count, begun.explain_not_applicable, begun.alive) == (Count(missing=9), 1, True)
     next(running)
     next(running)
     middle = status(out)

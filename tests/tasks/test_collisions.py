@@ -42,7 +42,7 @@ def residual(point: np.ndarray, directions: np.ndarray) -> float:
 
 def test_distances_to_what_meets_are_those_of_brute_force(database: Asset) -> None:
     defense, public = lifting(database), Public()
-    lifted = defense.lifted(OWN, public, np.random.default_rng(0))
+    lifted = defense.lift(OWN, public, np.random.default_rng(0))
     words = unit_rows(public.dictionary(database).words)
     points = np.concatenate([OWN.descriptors[:, None], words[lifted.words]], axis=1).astype(np.float64)  # (10, 3, D)
     (other,) = releases(defense, [example_features(8, seed=11)])
@@ -70,7 +70,7 @@ def test_no_collision_by_hand() -> None:
 def metrics(database: Asset, secrets: list[Features], dim: int = 4, **more: float) -> dict[str, float]:
     defense = lifting(database, dim)
     others = releases(defense, secrets)
-    found = Collisions(others=len(others), coverage=1, **more).judge(trial(defense, OWN, others=others)).metrics
+    found = Collisions(others=len(others), coverage=1, **more).evaluate(trial(defense, OWN, others=others)).metrics
     return {name: value for name, value in found.items() if value is not None}
 
 
@@ -98,7 +98,7 @@ def test_a_tolerance_above_every_distance_leaves_nothing(database: Asset) -> Non
 
 def test_releases_of_another_database_meet_nothing(database: Asset, tmp_path: Path) -> None:
     others = releases(lifting(small_dictionary(tmp_path, 24, seed=9)), [example_features(40, seed=11)])
-    found = Collisions(others=1).judge(trial(lifting(database), OWN.take(np.arange(1)), others=others)).metrics
+    found = Collisions(others=1).evaluate(trial(lifting(database), OWN.take(np.arange(1)), others=others)).metrics
     assert found["releases_asked"] == 1
     assert (found["coverage"], found["no_collision"], found["releases_kept"]) == (0, 0, 0)
     assert found["no_collision_covered"] is None
@@ -107,13 +107,15 @@ def test_releases_of_another_database_meet_nothing(database: Asset, tmp_path: Pa
 def test_only_as_many_others_as_asked_for(database: Asset) -> None:
     defense = lifting(database)
     others = releases(defense, [example_features(40, seed=seed) for seed in (11, 12, 13)])
-    assert Collisions(others=2, coverage=1).judge(trial(defense, OWN, others=others)).metrics["releases_asked"] == 2
+    assert Collisions(others=2, coverage=1).evaluate(trial(defense, OWN, others=others)).metrics["releases_asked"] == 2
 
 
 def test_what_does_not_fit_is_refused(database: Asset) -> None:
-    assert Collisions().inapplicable(lifting(database), None, Sift(), Public()) is None
-    assert "ldp does not say" in str(Collisions().inapplicable(LDP(dictionary=database), None, Sift(), Public()))
-    assert "no word" in str(Collisions().inapplicable(Affine(lifting="random", database=database), None, Sift(), Public()))
+    assert Collisions().explain_not_applicable(lifting(database), None, Sift(), Public()) is None
+    assert "ldp does not say" in str(Collisions().explain_not_applicable(LDP(dictionary=database), None, Sift(), Public()))
+    assert "no word" in str(
+        Collisions().explain_not_applicable(Affine(lifting="random", database=database), None, Sift(), Public())
+    )
     for wrong in (
         {"others": -1},
         {"coverage": 1.1},

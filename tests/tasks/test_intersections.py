@@ -22,7 +22,7 @@ def brute_force(defense: Affine, count: int, ratio: float, seed: int) -> dict[st
     words = unit_rows(public.dictionary(defense.database).words).astype(np.float64)
     found: dict[str, list[bool]] = {f"{name}_top{top}": [] for name in ("success", "with_adversarial") for top in COUNTS}
     for part in rounds(secret, count, rng):
-        lifted = defense.lifted(part, public, rng)
+        lifted = defense.lift(part, public, rng)
         for row in range(len(part)):
             basis, origin = lifted.release.bases[row].astype(np.float64), lifted.release.origins[row].astype(np.float64)
             away = [np.linalg.norm((word - origin) - basis.T @ np.linalg.lstsq(basis.T, word - origin)[0]) for word in words]
@@ -44,7 +44,7 @@ def brute_force(defense: Affine, count: int, ratio: float, seed: int) -> dict[st
 def test_measure_is_that_of_brute_force(tmp_path: Path, dim: int, count: int) -> None:
     defense = Affine(dim=dim, database=small_dictionary(tmp_path, 160))
     task = Intersections(subspaces=count, ratio=0.95)
-    metrics = task.judge(trial(defense, example_features(12), rng=np.random.default_rng(5))).metrics
+    metrics = task.evaluate(trial(defense, example_features(12), rng=np.random.default_rng(5))).metrics
     expected = brute_force(defense, count, 0.95, 5)
     assert {name: metrics[name] for name in expected} == pytest.approx(expected)
     assert metrics["subspaces"] == count
@@ -54,7 +54,7 @@ def test_measure_is_that_of_brute_force(tmp_path: Path, dim: int, count: int) ->
 def test_adversarial_words_succeed_by_construction(tmp_path: Path) -> None:
     """Why they are left out: at dimension 10 and N = 5 they alone are counted, and the data does not matter."""
     task, defense = Intersections(), Affine(dim=10, database=small_dictionary(tmp_path, 160))
-    metrics = task.judge(trial(defense, example_features(12))).metrics
+    metrics = task.evaluate(trial(defense, example_features(12))).metrics
     assert metrics["with_adversarial_top5"] == 1
     assert metrics["success_top5"] is not None
     assert metrics["success_top5"] < 1
@@ -86,9 +86,9 @@ def test_all_descriptors_are_lifted_equally_often(rng: np.random.Generator, coun
 def test_defenses_without_words_are_refused(tmp_path: Path) -> None:
     small = small_dictionary(tmp_path)
     task = Intersections()
-    assert task.inapplicable(Affine(database=small), None, Sift(), Public()) is None
-    assert "ldp does not say" in str(task.inapplicable(LDP(dictionary=small), None, Sift(), Public()))
-    assert "no word" in str(task.inapplicable(Affine(lifting="random", database=small), None, Sift(), Public()))
+    assert task.explain_not_applicable(Affine(database=small), None, Sift(), Public()) is None
+    assert "ldp does not say" in str(task.explain_not_applicable(LDP(dictionary=small), None, Sift(), Public()))
+    assert "no word" in str(task.explain_not_applicable(Affine(lifting="random", database=small), None, Sift(), Public()))
     for wrong in ({"ratio": 0.0}, {"ratio": float("nan")}, {"subspaces": -1}):
         with pytest.raises(UserError, match="must be"):
             Intersections(**wrong)

@@ -207,7 +207,7 @@ def judged(defense: Defense, poses: list[pycolmap.Rigid3d], keypoints: list[np.n
         SceneImage(name=f"{number}", camera=CAMERA, cam_from_world=pose, condition="day", pixels=nowhere)
         for number, pose in enumerate(poses)
     ]
-    return Structure().judge(replace(made, unit=replace(made.unit, subject=tuple(images)), shots=tuple(shots)))
+    return Structure().evaluate(replace(made, sample=replace(made.sample, subject=tuple(images)), images=tuple(shots)))
 
 
 @pytest.fixture
@@ -251,8 +251,8 @@ def test_the_walk_is_a_stretch_that_the_others_leave_out() -> None:
 
 def test_the_task_takes_the_first_queries_of_a_place() -> None:
     walk = Walk(views=5, others=3, steps=40, detail=0.1)
-    collection = Structure(images=4).collection(None, walk)
-    assert [len(unit.images) for unit in collection.units] == [4]
+    collection = Structure(images=4).collect(None, walk)
+    assert [len(unit.images) for unit in collection.samples] == [4]
     assert collection.scene is not None
     assert len(collection.scene.references) == 3
 
@@ -275,8 +275,8 @@ def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
         with pytest.raises(UserError, match="walk: "):
             Walk(**wrong)
     with pytest.raises(UserError, match="takes no images"):
-        Structure().collection(tmp_path, None)
+        Structure().collect(tmp_path, None)
     with pytest.raises(UserError, match="2 queries, of which nothing can be rebuilt"):
-        Structure().collection(None, Fixed(scene(tmp_path, queries=2)))
+        Structure().collect(None, Fixed(scene(tmp_path, queries=2)))
     with pytest.raises(UserError, match="are of different cameras"):
-        Structure().collection(None, Gallery(views=2, queries=12, rooms=1, detail=0.1))
+        Structure().collect(None, Gallery(views=2, queries=12, rooms=1, detail=0.1))

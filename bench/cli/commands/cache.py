@@ -6,7 +6,7 @@ import argparse
 from typing import TYPE_CHECKING
 
 from bench.cli.terminal import DONE, FAILED, number, print_rich, size, told_size
-from bench.core.errors import UserError, unknown
+from bench.core.errors import UserError, unknown_name
 
 if TYPE_CHECKING:
     from bench.cache.store import Entry
@@ -40,7 +40,7 @@ def execute(args: argparse.Namespace) -> int:
         raise (
             UserError(f"say what to do: bench cache {'|'.join(ACTIONS)}")
             if args.what is None
-            else unknown("command", f"cache {args.what}", [f"cache {action}" for action in ACTIONS])
+            else unknown_name("command", f"cache {args.what}", [f"cache {action}" for action in ACTIONS])
         )
     chosen = _chosen(args)
     if args.what == "list":
@@ -60,7 +60,7 @@ def _chosen(args: argparse.Namespace) -> list[Entry]:
     found = list(store.entries())
     kinds = {entry.kind for entry in found}
     if args.kind is not None and args.kind not in kinds:
-        raise unknown("kind", args.kind, kinds)
+        raise unknown_name("kind", args.kind, kinds)
     now = time.time()
     return [
         entry

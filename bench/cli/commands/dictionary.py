@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from bench.cli.terminal import DONE, add_extractor, add_seed, require, whole
-from bench.core.errors import UserError, unknown
+from bench.core.errors import UserError, unknown_name
 
 SUMMARY = "make dictionaries of descriptors: bench dictionary build"
 REQUIRED = ()
@@ -37,5 +37,5 @@ def execute(args: argparse.Namespace) -> int:
 
 def _what(text: str) -> str:
     if text != "build":
-        raise unknown("command", f"dictionary {text}", ["dictionary build"])
+        raise unknown_name("command", f"dictionary {text}", ["dictionary build"])
     return text

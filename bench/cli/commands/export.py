@@ -32,7 +32,7 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(args: argparse.Namespace) -> int:
-    from bench.core.errors import UnitError
+    from bench.core.errors import SampleError
     from bench.core.progress import Progress
     from bench.registry import discovery, spec
     from bench.runner import feature_export
@@ -45,7 +45,7 @@ def execute(args: argparse.Namespace) -> int:
     if args.out.exists():
         raise UserError(f"--out {args.out}: exists already; name a new file")
     attack = None if args.attack is None else spec.read(args.attack, discovery.ATTACK)
-    asked = runner.Asked(
+    asked = runner.RunConfiguration(
         pairs=((spec.read(args.defense, discovery.DEFENSE), attack),),
         images=args.images,
         task=Reconstruction(),
@@ -54,17 +54,17 @@ def execute(args: argparse.Namespace) -> int:
         seed=args.seed,
     )
     plan = runner.planned(asked)
-    (cell,) = plan.cells
+    (cell,) = plan.experiments
     if attack is not None and cell.reason is not None:
         raise UserError(cell.reason)
     trials = Trials(plan)
     found, failed = [], 0
-    with Progress(f"exporting for {args.layout}", len(plan.units)) as progress:
-        for unit in plan.units:
+    with Progress(f"exporting for {args.layout}", len(plan.samples)) as progress:
+        for unit in plan.samples:
             try:
                 path = args.images / unit.name
                 found.append(feature_export.described(trials.trial(cell, unit), path, attack))
-            except UnitError as error:
+            except SampleError as error:
                 failed += 1
                 progress.say(f"bench: failed: {unit.name}: {error}")
             progress.advance(note=unit.name)

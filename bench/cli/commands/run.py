@@ -57,16 +57,16 @@ def execute(args: argparse.Namespace) -> int:
     from bench.registry import discovery, spec
     from bench.runner import engines
     from bench.runner import plan as runner
-    from bench.runner.plan import Asked
+    from bench.runner.plan import RunConfiguration
     from leaderboard import localization_results, run_report
 
-    engine = engines.choose(args.workers, args.engine, args.scheduler)
+    engine = engines.choose_engine(args.workers, args.engine, args.scheduler)
     task = spec.read(args.task, discovery.TASK)
     _check_attacks(task, args.attack)
     defenses = [_defense(text, task) for text in args.defense]
     attacks = [spec.read(text, discovery.ATTACK) for text in args.attack or []]
-    asked = Asked(
-        pairs=runner.crossed(task, defenses, attacks),
+    asked = RunConfiguration(
+        pairs=runner.cross(task, defenses, attacks),
         images=args.images,
         task=task,
         extractor=spec.read(args.extractor, discovery.EXTRACTOR),
@@ -76,8 +76,10 @@ def execute(args: argparse.Namespace) -> int:
     )
     plan = runner.prepared(asked, engine.describe)
     out = args.out or Path("runs") / _run_name(plan)
-    records = watch.watched([plan], out, engine, f"{task.name()}: {len(plan.units)} units, {len(plan.cells)} pairs")
-    run_report.write(records, plan.units, out)
+    records = watch.execute_with_progress(
+        [plan], out, engine, f"{task.name()}: {len(plan.samples)} units, {len(plan.experiments)} pairs"
+    )
+    run_report.write(records, plan.samples, out)
     _print_records(records) if args.json else watch.print_tables(records)
     for line in localization_results.write(records, out):
         say(DONE, line)
@@ -92,8 +94,8 @@ def _defense(text: str, task: Task) -> Defense:
     from bench.registry import discovery, spec
 
     plugin, given = spec.parse(text, discovery.DEFENSE)
-    if task.places and plugin.quantised_by is not None:
-        given.setdefault(plugin.quantised_by, Asset(REFERENCES))
+    if task.needs_scene and plugin.dictionary_field is not None:
+        given.setdefault(plugin.dictionary_field, Asset(REFERENCES))
     return spec.build(plugin, given)
 
 
@@ -107,16 +109,16 @@ def _metric(text: str) -> Metric:
 
 
 def _check_attacks(task: Task, attacks: list[str] | None) -> None:
-    if task.attacked and not attacks:
+    if task.judges_attacks and not attacks:
         raise UserError(f"--attack is missing: the task {task.name()} judges what an attack recovers (bench list attacks)")
-    if attacks and not task.attacked:
+    if attacks and not task.judges_attacks:
         raise UserError(f"--attack: the task {task.name()} judges the release itself and takes none")
 
 
 def _run_name(plan: Plan) -> str:
     """The defenses' and attacks' names, and eight digits that tell configurations apart."""
-    defenses = dict.fromkeys(cell.defense.name() for cell in plan.cells)
-    attacks = dict.fromkeys(cell.attack.name() if cell.attack else plan.task.name() for cell in plan.cells)
+    defenses = dict.fromkeys(cell.defense.name() for cell in plan.experiments)
+    attacks = dict.fromkeys(cell.attack.name() if cell.attack else plan.task.name() for cell in plan.experiments)
     return f"{'+'.join(defenses)[:60]}-{'+'.join(attacks)[:60]}-{plan.hash[:8]}"
 
 

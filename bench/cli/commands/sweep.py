@@ -42,12 +42,12 @@ def execute(args: argparse.Namespace) -> int:
         chosen = chosen.on(args.images)
     if not chosen.parts:
         raise UserError(f"suite {args.suite!r} has no parts")
-    engine = engines.choose(args.workers, args.engine, args.scheduler)
+    engine = engines.choose_engine(args.workers, args.engine, args.scheduler)
     plans = [runner.prepared(part, engine.describe) for part in chosen.parts]
     out = args.out or suite.folder(args.suite)
-    pairs = sum(len(plan.cells) for plan in plans)
-    records = watch.watched(plans, out, engine, f"{args.suite}: {pairs} pairs")
-    units = {unit.name: unit for plan in plans for unit in plan.units}
+    pairs = sum(len(plan.experiments) for plan in plans)
+    records = watch.execute_with_progress(plans, out, engine, f"{args.suite}: {pairs} pairs")
+    units = {unit.name: unit for plan in plans for unit in plan.samples}
     run_report.write(records, list(units.values()), out)
     watch.print_tables(records)
     say(DONE, f"written to {out}")

@@ -59,7 +59,7 @@ def execute(args: argparse.Namespace) -> int:
 
     plugin, given = spec.parse(args.defense, discovery.DEFENSE)
     defense = spec.build(plugin, given)
-    served = {name: settings for name, settings in plugin.serves.items() if name not in given}
+    served = {name: settings for name, settings in plugin.supported_settings.items() if name not in given}
     photographs, validation = held_out(folder(args.images), args.validation)
     profile = PROFILES[args.profile]
     chosen = {name: value for name in ("steps", "batch", "rate", "seed") if (value := getattr(args, name)) is not None}

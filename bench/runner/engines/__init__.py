@@ -13,13 +13,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from bench.core import environment
-from bench.core.errors import UserError, unknown
+from bench.core.errors import UserError, unknown_name
 from bench.core.hashing import short_hash
-from bench.runner.trial import Made, Trials
+from bench.runner.trial import Result, Trials
 
 if TYPE_CHECKING:
-    from bench.images.samples import Unit
-    from bench.runner.plan import Cell, Plan
+    from bench.images.samples import Sample
+    from bench.runner.plan import Experiment, Plan
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,13 +27,13 @@ class Job:
     """One unit of one cell: what a record is made of."""
 
     plan: Plan
-    cell: Cell
-    unit: Unit
+    experiment: Experiment
+    sample: Sample
 
     @property
     def key(self) -> tuple[str, str]:
         """What its record is known by: `run_hash` and unit."""
-        return self.cell.head["run_hash"], self.unit.name
+        return self.experiment.metadata["run_hash"], self.sample.name
 
     @property
     def name(self) -> str:
@@ -42,10 +42,10 @@ class Job:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Letter:
+class JobMessage:
     """A job as it is sent to another process, which makes the same plan from what was asked."""
 
-    asked: bytes  # pickled
+    configuration: bytes  # pickled
     key: tuple[str, str]
     threads: int  # to compute with
 
@@ -66,7 +66,7 @@ class Engine(ABC):
         """
 
     @abstractmethod
-    def __call__(self, jobs: Iterator[Job]) -> Iterator[Made]:
+    def __call__(self, jobs: Iterator[Job]) -> Iterator[Result]:
         """Take jobs and yield what came of each.
 
         Raises
@@ -76,7 +76,7 @@ class Engine(ABC):
         """
 
 
-class Here(Engine):
+class InProcess(Engine):
     """This process, one job after the other."""
 
     name = "this process"
@@ -84,21 +84,21 @@ class Here(Engine):
     def describe(self, plugins: Iterable[object]) -> dict[str, Any]:
         return environment.describe(plugins)
 
-    def __call__(self, jobs: Iterator[Job]) -> Iterator[Made]:
+    def __call__(self, jobs: Iterator[Job]) -> Iterator[Result]:
         trials: Trials | None = None
         for job in jobs:
             if trials is None or trials.plan is not job.plan:
                 if trials is not None:
                     trials.forget()
                 trials = Trials(job.plan)
-            yield trials.carry_out(job.cell, job.unit)
+            yield trials.execute(job.experiment, job.sample)
 
 
-HERE = Here()
+IN_PROCESS = InProcess()
 ENGINES = ("processes", "dask")
 
 
-def choose(workers: int = 1, kind: str = ENGINES[0], scheduler: str | None = None) -> Engine:
+def choose_engine(workers: int = 1, kind: str = ENGINES[0], scheduler: str | None = None) -> Engine:
     """The engine of that kind: `workers` processes of this machine, or the workers of a dask scheduler.
 
     Raises
@@ -107,7 +107,7 @@ def choose(workers: int = 1, kind: str = ENGINES[0], scheduler: str | None = Non
         if there is no such kind, or it lacks what it needs.
     """
     if kind not in ENGINES:
-        raise unknown("engine", kind, ENGINES)
+        raise unknown_name("engine", kind, ENGINES)
     if kind == "dask":
         from bench.runner.engines.cluster import Cluster
 
@@ -119,22 +119,22 @@ def choose(workers: int = 1, kind: str = ENGINES[0], scheduler: str | None = Non
     if workers < 1:
         raise UserError(f"--workers must be at least 1, got {workers}")
     if workers == 1:
-        return HERE
+        return IN_PROCESS
     from bench.runner.engines.processes import Processes
 
     return Processes(workers)
 
 
-def letter(job: Job, threads: int) -> Letter:
+def write_message(job: Job, threads: int) -> JobMessage:
     """The job for another process."""
-    return Letter(asked=pickle.dumps(job.plan.asked), key=job.key, threads=threads)
+    return JobMessage(configuration=pickle.dumps(job.plan.configuration), key=job.key, threads=threads)
 
 
-def first_come(
-    submit: Callable[[Job], Future[Made]], room: Callable[[], int], jobs: Iterator[Job]
-) -> Iterator[tuple[Job, Future[Made]]]:
+def run_as_completed(
+    submit: Callable[[Job], Future[Result]], room: Callable[[], int], jobs: Iterator[Job]
+) -> Iterator[tuple[Job, Future[Result]]]:
     """Submit jobs while there is room for more, and yield each with its result as soon as there is one."""
-    waiting: dict[Future[Made], Job] = {}
+    waiting: dict[Future[Result], Job] = {}
     try:
         for job in jobs:
             waiting[submit(job)] = job

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from bench.core.errors import UserError
 from bench.runner import trial
-from bench.runner.engines import Engine, Job, first_come, letter, worker
-from bench.runner.trial import Made
+from bench.runner.engines import Engine, Job, run_as_completed, worker, write_message
+from bench.runner.trial import Result
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -45,12 +45,12 @@ class Cluster(Engine):
                     raise UserError(f"workers differ in {name}: {first} has {told[name]}, {address} has {other.get(name)}")
         return told
 
-    def __call__(self, jobs: Iterator[Job]) -> Iterator[Made]:
+    def __call__(self, jobs: Iterator[Job]) -> Iterator[Result]:
         from distributed import KilledWorker
 
         with self._client() as client, client.get_executor() as executor:
-            submitted = first_come(
-                lambda job: executor.submit(worker.carry_out, letter(job, THREADS), key=job.name),
+            submitted = run_as_completed(
+                lambda job: executor.submit(worker.carry_out, write_message(job, THREADS), key=job.name),
                 lambda: AHEAD * max(1, len(client.nthreads())),  # workers come and go
                 jobs,
             )
@@ -61,7 +61,7 @@ class Cluster(Engine):
                     raise UserError(f"--scheduler {self._scheduler}: the scheduler was lost; run again to go on") from None
                 except KilledWorker:
                     reason = "every worker that began this ended, perhaps for want of memory"
-                    yield Made(record=trial.record(job.cell, job.unit, status="failed", reason=reason))
+                    yield Result(record=trial.record(job.experiment, job.sample, status="failed", reason=reason))
 
     def _client(self) -> Client:
         try:

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from bench.core import environment, threads
 from bench.core.errors import UserError
-from bench.runner.engines import Engine, Job, first_come, letter, worker
-from bench.runner.trial import Made
+from bench.runner.engines import Engine, Job, run_as_completed, worker, write_message
+from bench.runner.trial import Result
 
 if TYPE_CHECKING:
     from bench.runner.plan import Plan
@@ -33,20 +33,20 @@ class Processes(Engine):
     def describe(self, plugins: Iterable[object]) -> dict[str, Any]:
         return environment.describe(plugins)
 
-    def __call__(self, jobs: Iterator[Job]) -> Iterator[Made]:
+    def __call__(self, jobs: Iterator[Job]) -> Iterator[Result]:
         # Processes are started afresh: a copy of one that has computed with several threads can hang.
         executor = ProcessPoolExecutor(self._workers, multiprocessing.get_context("spawn"), initializer=_begin)
         plans: set[Plan] = set()
 
-        def submit(job: Job) -> Future[Made]:
+        def submit(job: Job) -> Future[Result]:
             place = job.plan.public.place
             if place is not None and job.plan.needs_map and job.plan not in plans:
                 _ = place.map  # made once, before each process reads it
             plans.add(job.plan)
-            return executor.submit(worker.carry_out, letter(job, self._threads))
+            return executor.submit(worker.carry_out, write_message(job, self._threads))
 
         try:
-            for _, future in first_come(submit, lambda: AHEAD * self._workers, jobs):
+            for _, future in run_as_completed(submit, lambda: AHEAD * self._workers, jobs):
                 yield future.result()
         except BrokenProcessPool:
             raise UserError("a worker process was ended from outside, perhaps for want of memory; run again to go on") from None

@@ -10,14 +10,14 @@ from typing import Any
 from bench.core import environment, threads
 from bench.core.errors import UserError
 from bench.runner import plan
-from bench.runner.engines import Letter
-from bench.runner.trial import Made, Trials
+from bench.runner.engines import JobMessage
+from bench.runner.trial import Result, Trials
 
 _LAST: list[Trials] = []  # whose last unit is kept
 PLANS = 2  # that are kept: jobs come plan by plan, but one that was lost may come late
 
 
-def carry_out(letter: Letter) -> Made:
+def carry_out(letter: JobMessage) -> Result:
     """Do the job.
 
     Raises
@@ -26,15 +26,15 @@ def carry_out(letter: Letter) -> Made:
         if this process would do another: its source, its libraries or its photographs are not those of the sender.
     """
     threads.limit(letter.threads)
-    trials = _trials(letter.asked)
+    trials = _trials(letter.configuration)
     for last in _LAST:
         if last is not trials:
             last.forget()
     _LAST[:] = [trials]
     run_hash, name = letter.key
-    for cell in trials.plan.cells:
-        if cell.head["run_hash"] == run_hash:
-            return trials.carry_out(cell, next(unit for unit in trials.plan.units if unit.name == name))
+    for cell in trials.plan.experiments:
+        if cell.metadata["run_hash"] == run_hash:
+            return trials.execute(cell, next(unit for unit in trials.plan.samples if unit.name == name))
     raise UserError(
         "a worker has other source, libraries or files than there were when the run began: it would make other records; "
         "start all workers in one environment and folder, and run again"

@@ -66,7 +66,7 @@ def compute(seed: int = SEED) -> Toy:
     attack = build(discovery.ATTACK, "database", {"neighbours": NEIGHBOURS, "estimators": ESTIMATORS})
     assert isinstance(defense, Lifting)
     assert isinstance(attack, DescriptorAttack)
-    lifted = defense.lifted(secret, public, rng)
+    lifted = defense.lift(secret, public, rng)
     seen = View(release=lifted.release, defense=defense, extractor=Sift(), knowledge={Knowledge.DATABASE: lambda: dictionary})
     found, apart = nearest_to_subspaces(lifted.release, codes, WORDS)
     near = found[0, 1 : 1 + NEIGHBOURS]
