@@ -7,13 +7,26 @@ DATA ?= ../shared/data
 SMOKE := --defense none --defense affine --defense ldp:epsilon=16 --attack dia
 SPEED := runs/speed.json
 
-.PHONY: demo test lint smoke check baseline bench assets
+# One process a core, each with one thread; rewritten tests are cached even where the environment forbids bytecode.
+WORKERS ?= logical
+PYTEST := OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -q -n $(WORKERS) --dist worksteal
+
+.PHONY: demo test test-quick test-exhaustive coverage lint smoke check baseline bench assets
 
 demo: .venv/ready
 	$(BIN)/bench run $(DEMO)
 
-test: .venv/ready-to-test
-	$(BIN)/pytest -q
+test: .venv/ready-to-test # all but the exhaustive repetitions
+	$(PYTEST) -m "not exhaustive"
+
+test-quick: .venv/ready-to-test # without those that take about a second or more
+	$(PYTEST) -m "not exhaustive and not slow"
+
+test-exhaustive: .venv/ready-to-test # the rest: with `make test`, all there are
+	$(PYTEST) -m exhaustive
+
+coverage: .venv/ready-to-test # of lines, by all tests
+	$(PYTEST) --cov --cov-report=term:skip-covered
 
 lint: .venv/ready-to-test
 	$(BIN)/ruff check .

@@ -1,1 +1,1 @@
-"""Built-in attacks, one file each; `inversion` holds the network that paints images."""
+"""Built-in attacks, one file each."""

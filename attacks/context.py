@@ -1,8 +1,9 @@
-"""Context: which candidate of a keypoint is the true word, told by the candidates around it. In no paper that we follow.
+"""The context attack: finds the true word of a keypoint from the candidates of nearby keypoints. Not in the paper.
 
-Wrong words are drawn from the whole dictionary alike, true ones fit what the photograph shows there. A network that was trained
-on public photographs (`surroundings/`) gives each candidate its posterior chance, and the chance that it is none of them, which
-the defense's configuration sets beforehand, as well as the descriptor to be expected then.
+Wrong words are drawn uniformly from the dictionary, while true words fit the photograph at that position. The context model
+(`bench/context`), trained on public photographs, computes the posterior of each candidate and of none. The prior follows from
+the configuration of the defense. The model also predicts the descriptor for the case that the true word is none of the
+candidates.
 """
 
 from __future__ import annotations
@@ -15,31 +16,33 @@ from typing import Literal
 import numpy as np
 import torch
 
-from bench.api import Asset, Defense, DescriptorAttack, Extractor, View
+from bench.api import Defense, DescriptorAttack, Extractor, View
 from bench.codebook.public import ASSETS, Public
-from bench.context.encoding import prior_odds, scene
+from bench.context.encoding import build_graph, prior_odds
 from bench.context.network import Belief
 from bench.context.weights import Network, load
-from bench.inversion.weights import misfit
-from bench.types import Floats, Knowledge, WordSets
+from bench.inversion.weights import explain_incompatible
+from bench.settings import Asset
+from bench.threat_model import PublicAssets
+from bench.types import Floats, WordSets
 
 ESTIMATES = {"word": Belief.word, "mean": Belief.mean}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Context(DescriptorAttack):
-    """Weighs the candidates of each keypoint by those of the keypoints around it."""
+    """Weighs the candidates of each keypoint by the candidates of nearby keypoints."""
 
     accepts = (WordSets,)
-    needs = frozenset({Knowledge.TRAINING_IMAGES})
+    needs = frozenset({PublicAssets})
 
-    # The likeliest candidate, or the posterior mean, in which what is expected where it is none of them has its share. The mean
-    # has the smaller angle; but it is smooth as no descriptor is, and what the network for raw descriptors paints of it is worse.
+    # The likeliest candidate, or the posterior mean, which includes the predicted descriptor. The mean has the smaller angle, but
+    # it is smoother than a descriptor, so the network for raw descriptors reconstructs a worse image from it.
     estimate: Literal["word", "mean"] = "word"
     weights: Asset = Asset("shipped")
 
     def explain_incompatible(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
-        reason = misfit(self._network().meta, defense, extractor, public)
+        reason = explain_incompatible(self._network().meta, defense, extractor, public)
         return reason and f"no adapted attacker: {self._path().name} was {reason}"
 
     def assets(self, defense: Defense, extractor: Extractor, public: Public) -> Mapping[str, str]:
@@ -50,12 +53,12 @@ class Context(DescriptorAttack):
         if not isinstance(release, WordSets):
             raise TypeError(f"context attacks WordSets, got {type(release).__name__}")
         module = self._network().module
-        odds = prior_odds(view.defense, view.know(Knowledge.TRAINING_IMAGES), release.subset_size)
-        seen = scene([release], [odds], module.shape.neighbours)
+        odds = prior_odds(view.defense, view.know(PublicAssets).assets, release.subset_size)
+        graph = build_graph([release], [odds], module.shape.neighbours)
         with torch.inference_mode():
-            seen = seen.to(next(module.parameters()).device)
-            found = ESTIMATES[self.estimate](module(seen), seen.candidates)
-        return found.cpu().numpy()
+            graph = graph.to(next(module.parameters()).device)
+            estimates = ESTIMATES[self.estimate](module(graph), graph.candidates)
+        return estimates.cpu().numpy()
 
     def _path(self) -> Path:
         return ASSETS / "context.safetensors" if self.weights == "shipped" else Path(self.weights)

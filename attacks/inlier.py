@@ -1,10 +1,10 @@
-"""The inlier attack: the server keeps the keypoints that RANSAC verified, with the descriptors that their matches reveal.
+"""The inlier attack: the server takes the keypoints that RANSAC verifies, with the map's descriptors of their matches.
 
-The paper's supplement: what is static and in the map appears in the image, and what moves before it does not. It holds for any
-release that a server can localize, whatever it promises of one descriptor: the map tells the rest.
+From the paper's supplement: the reconstruction shows static content that is in the map, and not what moves in front of it. The
+attack applies to any release that a server can localize, whatever its guarantee for one descriptor.
 
-Subspaces do not tell what a photograph looks like well enough to retrieve references by them, yet localize where they are matched
-with the right ones. So they are matched with all.
+Subspaces are too ambiguous for image retrieval, but they localize when matched with the right references. So they are matched
+with all references.
 """
 
 from __future__ import annotations
@@ -16,36 +16,38 @@ import numpy as np
 from bench.api import Selection, SelectiveAttack, View
 from bench.core.errors import SampleError
 from bench.localization import map_matching
-from bench.types import Descriptors, Knowledge, Subspaces, WordSets
+from bench.threat_model import ServerMap
+from bench.types import Descriptors, Subspaces, WordSets
 
 
 @dataclass(frozen=True, kw_only=True)
 class Inlier(SelectiveAttack):
-    """Paints from those keypoints that the server could verify, by the map's descriptors of the points that they are of."""
+    """Reconstructs from the keypoints that the server verifies, with the map's descriptors of their points."""
 
     accepts = (Descriptors, Subspaces, WordSets)
-    needs = frozenset({Knowledge.MAP})
+    needs = frozenset({ServerMap})
 
-    retrieved: int = 20  # references that a query is matched with; of subspaces, all
+    retrieved: int = 20  # references that a query is matched with; subspaces: all
     trials: int = 30_000  # of RANSAC, at most
 
     def select(self, view: View, rng: np.random.Generator) -> Selection:
-        server = view.know(Knowledge.MAP)
-        matcher = map_matching.default(view.defense)
+        server = view.know(ServerMap).server
+        matcher = map_matching.select_matcher(view.defense)
         if matcher is None:
-            raise SampleError(f"nothing matches {type(view.release).__name__}")
+            raise SampleError(f"no matcher supports {type(view.release).__name__}")
         if isinstance(view.release, Subspaces):
-            references = np.arange(len(server.place.references))
+            references = np.arange(len(server.scene_index.reference_features))
         else:
-            references = server.seen_in(view.release, view.defense, self.retrieved)
+            references = server.retrieve_by_release(view.release, view.defense, self.retrieved)
         seed = int(rng.integers(2**31))
-        found = server.localize(view.release, view.defense, references, matcher, self.trials, seed)
-        verified = np.zeros(len(found.correspondences), bool) if found.estimate is None else found.estimate.inliers
-        keypoints = found.correspondences.keypoints[verified]
-        seen = server.place.map.descriptors[found.correspondences.rows[verified]]
+        localization = server.localize(view.release, view.defense, references, matcher, self.trials, seed)
+        matches, pose = localization.correspondences, localization.estimate
+        verified = np.zeros(len(matches), bool) if pose is None else pose.inliers
+        keypoints = matches.keypoints[verified]
+        descriptors = server.scene_index.map.descriptors[matches.rows[verified]]
         rows, first = np.unique(keypoints, return_index=True)
         view.notes.append(f"{len(rows)} keypoints verified")
-        return Selection(rows=rows, descriptors=seen[first])
+        return Selection(rows=rows, descriptors=descriptors[first])
 
 
 PLUGIN = Inlier

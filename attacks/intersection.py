@@ -1,9 +1,10 @@
-"""The intersection attack: with releases of other photographs alone, and neither W nor a database of the attacker's own.
+"""The intersection attack: with other releases only, and without W or a database of the attacker's own. Not in the paper.
 
-Two subspaces that go through one word meet in it, and W's words are 8-bit vectors: so where subspaces of releases that share a
-sub-database meet, its words are found to the last bit. Whatever two or more subspaces go through is collected into a database,
-and the database attack's steps follow (the paper's Sec. 4.1): a subspace's adversarial words are those in it, and the words next
-nearest to it that are farthest from these estimate the descriptor. In no paper; the paper's clustering attack needs Z as well.
+Two subspaces that contain the same word intersect in it, and the words of W are 8-bit vectors. So the intersections of
+subspaces that share a sub-database give its words to the last bit. The points in two or more subspaces form a reconstructed
+database. Then the steps of the database attack follow (the paper's Sec. 4.1): the adversarial words of a subspace are those in
+it, and the words next nearest to it that are farthest from these estimate the descriptor. The paper's clustering attack needs Z
+as well.
 """
 
 from __future__ import annotations
@@ -15,26 +16,27 @@ import numpy as np
 from bench.api import Defense, DescriptorAttack, Extractor, View, explain_no_words, require_subspaces
 from bench.codebook.public import Public
 from bench.core.errors import UserError
-from bench.geometry.database_reconstruction import rebuilt
+from bench.geometry.database_reconstruction import reconstruct_database
 from bench.geometry.estimates import estimate
-from bench.geometry.intersections import meetings_within
+from bench.geometry.intersections import find_intersections_within
 from bench.geometry.nearest_words import unit_rows
-from bench.geometry.shared_sub_database import company
-from bench.geometry.subspaces import feet_and_frames, nearest_to_subspaces
-from bench.types import Bytes, Floats, Knowledge, Subspaces
+from bench.geometry.shared_sub_database import find_shared_sub_database
+from bench.geometry.subspaces import feet_and_frames, find_nearest_to_subspaces
+from bench.threat_model import OtherReleases
+from bench.types import Bytes, Floats, Subspaces
 
 
 @dataclass(frozen=True, kw_only=True)
 class Intersection(DescriptorAttack):
-    """Rebuilds the words of the photograph's sub-database from where subspaces meet, and attacks with these."""
+    """Reconstructs the words of the photograph's sub-database from subspace intersections, and attacks with these."""
 
     accepts = (Subspaces,)
-    needs = frozenset({Knowledge.OTHER_RELEASES})
+    needs = frozenset({OtherReleases})
 
-    neighbours: int = 1024  # |V|: rebuilt words next nearest to the subspace
-    estimators: int = 2  # |U|: those of them that the estimate is made of
-    coverage: float = 0.95  # releases are asked for until this share of the photograph's words is met
-    others: int = 800  # c: releases of other photographs that there are to ask for
+    neighbours: int = 1024  # |V|: reconstructed words next nearest to the subspace
+    estimators: int = 2  # |U|: those of them that form the estimate
+    coverage: float = 0.95  # stop reading releases once this fraction of the photograph's words is covered
+    others: int = 800  # c: number of other releases that can be read
 
     def __post_init__(self) -> None:
         if not 1 <= self.estimators <= self.neighbours:
@@ -49,18 +51,18 @@ class Intersection(DescriptorAttack):
 
     def recover(self, view: View, rng: np.random.Generator) -> Floats:
         release, adversarial = require_subspaces(view)
-        shared = company(release, view.know(Knowledge.OTHER_RELEASES)(self.others), adversarial, self.coverage)
-        words = rebuilt(meetings_within(shared.subspaces))
+        shared = find_shared_sub_database(release, view.know(OtherReleases).draw(self.others), adversarial, self.coverage)
+        words = reconstruct_database(find_intersections_within(shared.subspaces))
         view.notes.append(f"{shared.summary()}; {len(words)} words rebuilt")
-        return described(release, words, adversarial, self.neighbours, self.estimators)
+        return estimate_descriptors(release, words, adversarial, self.neighbours, self.estimators)
 
 
-def described(release: Subspaces, words: Bytes, adversarial: int, neighbours: int, estimators: int) -> Floats:
-    """The estimates that these words allow; without any, the directions of the subspaces' points nearest to zero. -> (N, D)"""
+def estimate_descriptors(release: Subspaces, words: Bytes, adversarial: int, neighbours: int, estimators: int) -> Floats:
+    """Estimate descriptors from words; without words, by the direction of each subspace's point nearest to zero. -> (N, D)"""
     if len(words) == 0:
         return unit_rows(feet_and_frames(release)[0].astype(np.float32))
-    found, distances = nearest_to_subspaces(release, words, adversarial + neighbours)
-    return estimate(release, words, found, distances, adversarial, estimators)
+    nearest, distances = find_nearest_to_subspaces(release, words, adversarial + neighbours)
+    return estimate(release, words, nearest, distances, adversarial, estimators)
 
 
 PLUGIN = Intersection

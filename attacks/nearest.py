@@ -1,7 +1,7 @@
-"""Nearest (Dusmanu et al., CVPR 2021; the paper's Table 1).
+"""The nearest attack (Dusmanu et al., CVPR 2021; the paper's Table 1).
 
-Each subspace is replaced by its nearest neighbour in a public database. That is the attacker's own Z: in the defense's W the
-nearest would be an adversarial descriptor.
+It replaces each subspace by its nearest neighbour in a public database, the attacker's own Z. In the defense's W the nearest
+word would be an adversarial descriptor.
 """
 
 from __future__ import annotations
@@ -10,18 +10,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.api import Asset, DescriptorAttack, View
+from bench.api import DescriptorAttack, View
 from bench.geometry.nearest_words import unit_rows
-from bench.geometry.subspaces import nearest_to_subspaces
-from bench.types import Floats, Knowledge, Subspaces
+from bench.geometry.subspaces import find_nearest_to_subspaces
+from bench.settings import Asset
+from bench.threat_model import PublicDatabase
+from bench.types import Floats, Subspaces
 
 
 @dataclass(frozen=True, kw_only=True)
 class Nearest(DescriptorAttack):
-    """Takes the public word nearest to each subspace for the descriptor."""
+    """Estimates the descriptor by the public word nearest to the subspace."""
 
     accepts = (Subspaces,)
-    needs = frozenset({Knowledge.PUBLIC_DATABASE})
+    needs = frozenset({PublicDatabase})
 
     database: Asset = Asset("shipped-public")
 
@@ -29,8 +31,8 @@ class Nearest(DescriptorAttack):
         release = view.release
         if not isinstance(release, Subspaces):
             raise TypeError(f"nearest attacks Subspaces, got {type(release).__name__}")
-        words = view.know(Knowledge.PUBLIC_DATABASE).words  # (K, D)
-        nearest, _ = nearest_to_subspaces(release, words)  # (N, 1)
+        words = view.know(PublicDatabase).words  # (K, D)
+        nearest, _ = find_nearest_to_subspaces(release, words)  # (N, 1)
         return unit_rows(words[nearest[:, 0]])
 
 

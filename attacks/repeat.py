@@ -1,7 +1,7 @@
-"""Repeat: the attacker sees the same features released several times, as by a video, or a client that tries again.
+"""The repeat attack: uses several releases of the same features, as from a video or a client that retries. Not in the paper.
 
-Two liftings of one descriptor are subspaces that meet in it, so two suffice. In word sets the true word recurs: of T sets, the
-word that stands in most has the greatest likelihood, and T releases are T ε-LDP and no more. In no paper that we follow.
+Two liftings of one descriptor are subspaces that intersect in it, so two suffice. In word sets the true word recurs: the word
+in most of T sets has the greatest likelihood. T releases are T ε-LDP and no more.
 """
 
 from __future__ import annotations
@@ -13,19 +13,20 @@ import numpy as np
 
 from bench.api import DescriptorAttack, View
 from bench.core.errors import UserError
-from bench.geometry.metric_inputs import directions
-from bench.mechanisms.multi_release import common_points, likeliest
-from bench.types import Floats, Indices, Knowledge, Release, Subspaces, WordSets
+from bench.geometry.metric_inputs import normalize_rows
+from bench.mechanisms.multi_release import find_common_points, select_likeliest
+from bench.threat_model import RepeatedReleases
+from bench.types import Floats, Indices, Release, Subspaces, WordSets
 
 
 @dataclass(frozen=True, kw_only=True)
 class Repeat(DescriptorAttack):
-    """Takes the point where the subspaces of a keypoint meet, or the word that its sets repeat."""
+    """Estimates the descriptor by the intersection of a keypoint's subspaces, or by the word that its sets repeat."""
 
     accepts = (Subspaces, WordSets)
-    needs = frozenset({Knowledge.REPEATED_RELEASES})
+    needs = frozenset({RepeatedReleases})
 
-    releases: int = 2  # of the same features, the one that every attack sees included
+    releases: int = 2  # of the same features, including the first
 
     def __post_init__(self) -> None:
         if self.releases < 1:
@@ -35,19 +36,19 @@ class Repeat(DescriptorAttack):
         return self.releases - 1
 
     def recover(self, view: View, rng: np.random.Generator) -> Floats:
-        seen: list[Release] = [view.release, *view.know(Knowledge.REPEATED_RELEASES)]
-        subspaces = [release for release in seen if isinstance(release, Subspaces)]
-        if len(subspaces) == len(seen):
-            return directions(common_points(subspaces)).astype(np.float32)
-        sets = [release for release in seen if isinstance(release, WordSets)]
-        if len(sets) < len(seen):
+        releases: list[Release] = [view.release, *view.know(RepeatedReleases).releases]
+        subspaces = [release for release in releases if isinstance(release, Subspaces)]
+        if len(subspaces) == len(releases):
+            return normalize_rows(find_common_points(subspaces)).astype(np.float32)
+        sets = [release for release in releases if isinstance(release, WordSets)]
+        if len(sets) < len(releases):
             raise TypeError(f"repeat attacks Subspaces or WordSets, got {type(view.release).__name__}")
         candidates = np.concatenate([release.candidates for release in sets], axis=1)  # (N, T m, D)
-        return candidates[np.arange(len(candidates)), likeliest(names(sets), rng)]
+        return candidates[np.arange(len(candidates)), select_likeliest(label_candidates(sets), rng)]
 
 
-def names(sets: Sequence[WordSets]) -> Indices:
-    """Numbers that tell candidates apart: their words, or, where there is no dictionary, one for each pattern. -> (N, T m)"""
+def label_candidates(sets: Sequence[WordSets]) -> Indices:
+    """Label candidates: by their words, or, without a dictionary, by one number per pattern. -> (N, T m)"""
     words = [release.words for release in sets if release.words is not None]
     if len(words) == len(sets):
         return np.concatenate(words, axis=1)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from bench.mechanisms.protection import protect
-    from bench.runner.plan import run
+    from bench.runner.execute import run
     from bench.runner.records import load_records
 
     __version__: str
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 __all__ = ["__version__", "load_records", "protect", "run"]
 
 # Imported when first used, so that `import bench` and `bench --help` cost nothing.
-_HOMES = {"protect": "bench.mechanisms.protection", "load_records": "bench.runner.records", "run": "bench.runner.plan"}
+_HOMES = {"protect": "bench.mechanisms.protection", "load_records": "bench.runner.records", "run": "bench.runner.execute"}
 
 
 def __getattr__(name: str) -> Any:

@@ -1,9 +1,10 @@
 """The contract of plugins as checks that raise AssertionError. Run them on your own plugin:
 
-from bench.testing import check_defense, example_features, small_dictionary
+from bench.codebook.examples import draw_features, write_dictionary
+from bench.testing import check_defense
 
 def test_mine(tmp_path):
-    check_defense(Mine(dictionary=small_dictionary(tmp_path)), Public(), example_features())
+    check_defense(Mine(dictionary=write_dictionary(tmp_path)), Public(), draw_features())
 """
 
 from __future__ import annotations
@@ -17,28 +18,17 @@ from typing import Any
 
 import numpy as np
 
-from bench.api import (
-    Attack,
-    Dataset,
-    Defense,
-    DescriptorAttack,
-    Extractor,
-    ImageAttack,
-    Metric,
-    Outcome,
-    ProtectedImage,
-    Task,
-    Trial,
-)
+from bench.api import Attack, Dataset, Defense, DescriptorAttack, Extractor, ImageAttack, Metric
 from bench.cache import feature_cache, store
 from bench.codebook import dictionary
-from bench.codebook.examples import example_features
+from bench.codebook.examples import draw_features
 from bench.codebook.public import Public
 from bench.formats import tensor_file
 from bench.geometry.nearest_words import unit_rows
 from bench.images import photographs
 from bench.images.samples import Sample
-from bench.tasks.reconstruction import Reconstruction, view
+from bench.task_api import Outcome, ProtectedImage, Task, Trial
+from bench.tasks.reconstruction import Reconstruction, build_view
 from bench.types import Descriptors, Features, Floats, Indices, Release, Subspaces, WordSets
 
 TOLERANCE = 1e-5  # of norms and angles in float32
@@ -85,7 +75,7 @@ def check_attack(attack: Attack, defense: Defense, extractor: Extractor, secret:
 
     What it returns must be bit-identical when the secret and the caches are overwritten after the release, those on disk too.
     """
-    with tempfile.TemporaryDirectory() as folder, store.within(Path(folder)):
+    with tempfile.TemporaryDirectory() as folder, store.use_folder(Path(folder)):
         _check_attack(attack, defense, extractor, secret)
 
 
@@ -93,13 +83,13 @@ def _check_attack(attack: Attack, defense: Defense, extractor: Extractor, secret
     cached: list[Indices] = []
 
     def quantise(known: dictionary.Dictionary, rows: Any) -> Indices:
-        cached.append(feature_cache.nearest_words(known, rows))
+        cached.append(feature_cache.find_nearest_words(known, rows))
         return cached[-1]
 
     public = Public(quantise)
     store.fetch(feature_cache.KIND, "the secret", lambda: (feature_cache.to_arrays(secret), {"size": list(secret.size)}))
     mine = copy.deepcopy(secret)
-    strangers = [example_features(len(secret), seed) for seed in range(5, 8)]
+    strangers = [draw_features(len(secret), seed) for seed in range(5, 8)]
 
     def others(count: int) -> Iterator[Release]:
         return (defense.protect(features, Public(), np.random.default_rng(4)) for features in strangers[:count])
@@ -127,9 +117,9 @@ def _check_attack(attack: Attack, defense: Defense, extractor: Extractor, secret
     assert first.dtype == np.float32
     for array in (*_arrays(mine), *cached):
         array[...] = 0
-    for entry in store.entries():
+    for entry in store.list_entries():
         overwrite(entry.path, entry.kind)
-    public.forget()
+    public.clear()
     assert np.array_equal(first, _estimate(trial)), "the attack saw more than the release"
 
 
@@ -138,10 +128,10 @@ def check_metric(metric: Metric, seed: int = 0) -> None:
     rng = np.random.default_rng(seed)
     if metric.compares == "images":
         # Somebody's portrait, and noise that little is left of it under: a metric may have nothing to say of other pictures.
-        truth = (photographs.read(photographs.of_people()[0].path).pixels / 255).astype(np.float32)
+        truth = (photographs.read(photographs.list_people()[0].path).pixels / 255).astype(np.float32)
         estimate = np.clip(truth + rng.normal(0, 0.5, truth.shape), 0, 1).astype(np.float32)
     else:
-        truth, estimate = example_features(30, seed).descriptors, example_features(30, seed + 1).descriptors
+        truth, estimate = draw_features(30, seed).descriptors, draw_features(30, seed + 1).descriptors
     before = truth.copy(), estimate.copy()
     perfect, value = metric(truth, truth.copy()), metric(truth, estimate)
     assert np.array_equal(truth, before[0])
@@ -185,7 +175,7 @@ def check_task(task: Task, defense: Defense, extractor: Extractor, secret: Featu
     released = copy.deepcopy(release)
 
     def others(count: int) -> Iterator[Release]:
-        return (defense.protect(example_features(9, seed), public, np.random.default_rng(3)) for seed in range(count))
+        return (defense.protect(draw_features(9, seed), public, np.random.default_rng(3)) for seed in range(count))
 
     def judged() -> Outcome:
         trial = Trial(
@@ -239,7 +229,7 @@ def same_array(one: np.ndarray, other: np.ndarray) -> bool:
 
 
 def _estimate(trial: Trial) -> Floats:
-    seen, rng = view(trial), np.random.default_rng(3)
+    seen, rng = build_view(trial), np.random.default_rng(3)
     if isinstance(trial.attack, DescriptorAttack):
         return trial.attack.recover(seen, rng)
     assert isinstance(trial.attack, ImageAttack)

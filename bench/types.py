@@ -1,4 +1,4 @@
-"""What flows through the benchmark: the secret `Features`, the three kinds of `Release`, and what an attacker may know.
+"""The secret `Features`, and a `Release`: positions × descriptors.
 
 Shapes use N for keypoints, D for a descriptor's length, m for candidates a keypoint, dim for a subspace's dimension.
 """
@@ -6,8 +6,7 @@ Shapes use N for keypoints, D for a descriptor's length, m for candidates a keyp
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from enum import Enum
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,13 +18,13 @@ Indices = NDArray[np.int64]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Features:
-    """What the phone extracted from one photograph, and the only secret of the benchmark."""
+    """Features that the phone extracted from one photograph: the only secret of the benchmark."""
 
     keypoints: Floats  # (N, 2) x, y in pixels; the centre of the top-left pixel is (0.5, 0.5)
     descriptors: Floats  # (N, D) unit norm
     codes: Bytes | None  # (N, D) the 8-bit vectors that the descriptors came from, where there are any
     size: tuple[int, int]  # width, height in pixels
-    frames: Floats | None = None  # (N, 2) scale in pixels and orientation in radians, where the extractor tells them
+    frames: Floats | None = None  # (N, 2) scale in pixels and orientation in radians, where the extractor reports them
 
     def __len__(self) -> int:
         return len(self.keypoints)
@@ -49,22 +48,65 @@ class Features:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Release:
-    """What leaves the phone. The keypoints' positions and their number are released in the clear."""
+class Positions:
+    """Where a release says that its keypoints are: a base class, one subclass for each kind."""
 
-    keypoints: Floats  # (N, 2)
-    size: tuple[int, int]  # width, height
+    def __len__(self) -> int:
+        """The number of keypoints."""
+        raise NotImplementedError
+
+    def take(self, rows: NDArray[Any]) -> Self:
+        """Return the positions of some keypoints, in the order of `rows`: indices, or a mask."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Points(Positions):
+    """Positions in the clear."""
+
+    keypoints: Floats  # (N, 2) x, y in pixels
 
     def __len__(self) -> int:
         return len(self.keypoints)
 
+    def take(self, rows: NDArray[Any]) -> Points:
+        return Points(keypoints=self.keypoints[rows])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Release:
+    """What leaves the phone: positions × descriptors.
+
+    The class says how descriptors are released, and the class of `positions` how positions are. Their number is released in the
+    clear.
+    """
+
+    positions: Positions
+    size: tuple[int, int]  # width, height in pixels
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    @property
+    def keypoints(self) -> Floats:
+        """(N, 2) x, y in pixels.
+
+        Raises
+        ------
+        TypeError
+            if the release has no points.
+        """
+        if not isinstance(self.positions, Points):
+            raise TypeError(f"this release has {type(self.positions).__name__}, not Points")
+        return self.positions.keypoints
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Descriptors(Release):
-    """One descriptor a keypoint, and what else of it is sent."""
+    """One descriptor a keypoint, and what else of it is released."""
 
     descriptors: Floats  # (N, D)
-    frames: Floats | None = None  # (N, 1) scale in pixels, or (N, 2) with orientation in radians, where they are sent
+    frames: Floats | None = None  # (N, 1) scale in pixels, or (N, 2) with orientation in radians, where they are released
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -79,13 +121,13 @@ class Subspaces(Release):
         return self.bases.shape[1]
 
     def take(self, rows: NDArray[Any]) -> Subspaces:
-        """The subspaces of some keypoints, in the order of `rows`: indices, or a mask."""
-        return replace(self, keypoints=self.keypoints[rows], origins=self.origins[rows], bases=self.bases[rows])
+        """Return the subspaces of some keypoints, in the order of `rows`: indices, or a mask."""
+        return replace(self, positions=self.positions.take(rows), origins=self.origins[rows], bases=self.bases[rows])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class WordSets(Release):
-    """A set of m candidate descriptors a keypoint; the order of a row carries nothing."""
+    """A set of m candidate descriptors a keypoint; the order of a row carries no information."""
 
     candidates: Floats  # (N, m, D) unit norm
     words: Indices | None  # (N, m) rows of the dictionary, ascending; None where there is no dictionary
@@ -93,14 +135,3 @@ class WordSets(Release):
     @property
     def subset_size(self) -> int:
         return self.candidates.shape[1]
-
-
-class Knowledge(Enum):
-    """What an attacker may have beside the release."""
-
-    DATABASE = "the database W that lifting drew its adversarial descriptors from"
-    PUBLIC_DATABASE = "a database Z of the attacker's own, from other photographs"
-    OTHER_RELEASES = "other releases made with the same database"
-    REPEATED_RELEASES = "further releases of the same photograph"
-    MAP = "the server's map"
-    TRAINING_IMAGES = "photographs to train an inversion network on"

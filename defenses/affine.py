@@ -1,7 +1,7 @@
 """Affine subspace lifting (Dusmanu et al., CVPR 2021; the paper's Sec. 3).
 
 A descriptor d becomes D = d + span(d_1, ..., d_dim), where d_i = a_i − d for an adversarial descriptor a_i of the database,
-or d_i ~ U([-1, 1])^n. Of D, a fresh origin and a fresh basis are released, made from D and random vectors alone.
+or d_i ~ U([-1, 1])^n. The release is a new origin and a new basis of D, computed from D and random vectors alone.
 """
 
 from __future__ import annotations
@@ -13,30 +13,31 @@ from typing import ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.api import Asset, Between, LiftedRelease, Lifting, OneOf, Privacy
+from bench.api import LiftedRelease, Lifting, Privacy
 from bench.codebook.public import Public
 from bench.core.errors import SampleError, UserError
 from bench.geometry.nearest_words import unit_rows
 from bench.mechanisms.subset import draw_distinct
-from bench.types import Bytes, Features, Floats, Indices, Subspaces
+from bench.settings import Asset, Between, OneOf
+from bench.types import Bytes, Features, Floats, Indices, Points, Subspaces
 
 Doubles = NDArray[np.float64]
 
-# A direction that leaves the span of those before it by less than this (of its length) adds no dimension.
-DEGENERATE = 1e-6
-TRIES = 100
+# A direction adds no dimension if this fraction of its length, or less, lies outside the span of those before it.
+DEGENERATE_FRACTION = 1e-6
+MAX_DRAWS = 100
 
 
 @dataclass(frozen=True, kw_only=True)
 class Affine(Lifting):
     """Releases a random affine subspace through the descriptor and, unless lifting=random, through words of a database.
 
-    The adversarial words of a photograph come from one sub-database, drawn for it; those of a keypoint are distinct.
+    The adversarial words of a photograph come from one randomly drawn sub-database; the words of one keypoint are distinct.
     """
 
     supported_settings: ClassVar[Mapping[str, Between | OneOf]] = {"dim": OneOf((2, 4, 6, 8, 10, 12, 14, 16))}
 
-    lifting: Literal["random", "adversarial", "hybrid"] = "hybrid"  # none, all or half of the directions lead to words
+    lifting: Literal["random", "adversarial", "hybrid"] = "hybrid"  # none, all or half of the directions point to words
     dim: int = 4  # of the subspace
     sub_databases: int = 16  # parts of the database
     database: Asset = Asset("shipped")
@@ -59,18 +60,18 @@ class Affine(Lifting):
         length = secret.descriptors.shape[1]
         if self.dim >= length:
             raise UserError(f"affine: dim must be below the descriptors' length, {length}, got {self.dim}")
-        start, words = self._sub_database(length, public, rng)
+        first, words = self._draw_sub_database(length, public, rng)
         d = secret.descriptors.astype(np.float64)  # (N, D)
-        span, drawn = lift(d, words, self.adversarial, self.dim, rng)  # (N, dim, D), (N, adversarial)
+        span, indices = lift(d, words, self.adversarial, self.dim, rng)  # (N, dim, D), (N, adversarial)
         origins, bases = reparameterise(d, span, rng)
-        release = Subspaces(keypoints=secret.keypoints.copy(), size=secret.size, origins=origins, bases=bases)
-        return LiftedRelease(release=release, words=start + drawn)
+        release = Subspaces(positions=Points(keypoints=secret.keypoints.copy()), size=secret.size, origins=origins, bases=bases)
+        return LiftedRelease(release=release, words=first + indices)
 
     def privacy(self, public: Public) -> Privacy:
         return Privacy("none")
 
-    def _sub_database(self, length: int, public: Public, rng: np.random.Generator) -> tuple[int, Bytes]:
-        """The words that one photograph draws from, and the row of the database where they begin. -> (S, D)"""
+    def _draw_sub_database(self, length: int, public: Public, rng: np.random.Generator) -> tuple[int, Bytes]:
+        """Draw the sub-database of a photograph: its first row in the database, and its words (S, D)."""
         if self.adversarial == 0:
             return 0, np.empty((0, length), dtype=np.uint8)
         database = public.dictionary(self.database)
@@ -79,47 +80,47 @@ class Affine(Lifting):
         smallest = len(database) // self.sub_databases
         if smallest < self.adversarial:
             raise UserError(
-                f"affine: {self.adversarial} words a keypoint, but {len(database)} words in {self.sub_databases} "
+                f"affine: {self.adversarial} words per keypoint, but {len(database)} words in {self.sub_databases} "
                 f"sub-databases leave {smallest} each"
             )
-        chosen = int(rng.integers(self.sub_databases))
-        return database.start(chosen, self.sub_databases), database.sub_database(chosen, self.sub_databases)
+        part = int(rng.integers(self.sub_databases))
+        return database.start(part, self.sub_databases), database.sub_database(part, self.sub_databases)
 
 
 def lift(d: Doubles, words: Bytes, adversarial: int, dim: int, rng: np.random.Generator) -> tuple[Doubles, Indices]:
-    """Orthonormal bases of the directions of D, and the words it goes through. (N, D), (S, D) -> (N, dim, D), (N, adversarial)
+    """Draw words and return orthonormal bases of D's directions, and the words. (N, D), (S, D) -> (N, dim, D), (N, adversarial)
 
-    Where a word is the descriptor itself, or the directions are otherwise short of `dim` dimensions, all are drawn again.
+    Where the directions span fewer than `dim` dimensions, as when a word is the descriptor itself, all are drawn again.
 
     Raises
     ------
-    UnitError
-        if they still are after TRIES draws: the sub-database has too few words that differ from the descriptor.
+    SampleError
+        if MAX_DRAWS draws fail: the sub-database has too few words that differ from the descriptor.
     """
     rows, length = d.shape
     span = np.empty((rows, length, dim))
-    drawn = np.empty((rows, adversarial), dtype=np.int64)
+    indices = np.empty((rows, adversarial), dtype=np.int64)
     waiting = np.arange(rows)
-    for _ in range(TRIES):
+    for _ in range(MAX_DRAWS):
         directions = np.empty((len(waiting), dim, length))
-        drawn[waiting] = draw_distinct(len(waiting), len(words), adversarial, rng)
-        a = unit_rows(words[drawn[waiting]])  # (waiting, adversarial, D)
+        indices[waiting] = draw_distinct(len(waiting), len(words), adversarial, rng)
+        a = unit_rows(words[indices[waiting]])  # (waiting, adversarial, D)
         directions[:, :adversarial] = a - d[waiting, None]
         directions[:, adversarial:] = rng.uniform(-1, 1, (len(waiting), dim - adversarial, length))
         lengths = np.linalg.norm(directions, axis=2)  # (waiting, dim)
         span[waiting], triangle = np.linalg.qr(directions.transpose(0, 2, 1))
-        gained = np.abs(np.diagonal(triangle, axis1=1, axis2=2))  # (waiting, dim) what each adds to those before it
-        waiting = waiting[(gained <= DEGENERATE * lengths).any(axis=1)]
+        gains = np.abs(np.diagonal(triangle, axis1=1, axis2=2))  # (waiting, dim) distance to the span of those before
+        waiting = waiting[(gains <= DEGENERATE_FRACTION * lengths).any(axis=1)]
         if len(waiting) == 0:
-            return span.transpose(0, 2, 1), drawn
+            return span.transpose(0, 2, 1), indices
     raise SampleError(f"affine: a descriptor lies in the span of every draw of {adversarial} words of its sub-database")
 
 
 def reparameterise(d: Doubles, span: Doubles, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """A fresh origin and orthonormal basis of d + span, which depend on nothing else. -> (N, D), (N, dim, D)
+    """Return a new origin and orthonormal basis of d + span, which depend on nothing else. -> (N, D), (N, dim, D)
 
     The origin is the projection onto D of e_0, the basis that of e_1, ..., e_dim onto the directions of D, orthonormalised;
-    all e ~ U([-1, 1])^n. A projection onto D is the same whatever point and basis D was described by.
+    all e ~ U([-1, 1])^n. A projection onto D does not depend on the point and basis that describe D.
     """
     rows, dim, length = span.shape
     e = rng.uniform(-1, 1, (rows, 1 + dim, length))
@@ -127,7 +128,7 @@ def reparameterise(d: Doubles, span: Doubles, rng: np.random.Generator) -> tuple
     coordinates = e @ span.transpose(0, 2, 1)  # (N, 1 + dim, dim) of the projections in `span`
     origins = d + (coordinates[:, :1] @ span)[:, 0]
     mixing, triangle = np.linalg.qr(coordinates[:, 1:].transpose(0, 2, 1))  # (N, dim, dim) twice
-    # LAPACK's signs depend on `span`, and would tell on which side of D the secret lies. Gram-Schmidt's do not.
+    # LAPACK's signs depend on `span`, and would reveal on which side of D the secret lies. Gram-Schmidt's do not.
     mixing *= np.sign(np.diagonal(triangle, axis1=1, axis2=2))[:, None]
     bases = mixing.transpose(0, 2, 1) @ span
     return origins.astype(np.float32), bases.astype(np.float32)

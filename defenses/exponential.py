@@ -1,20 +1,19 @@
-"""Exponential: words that are the likelier, the more they are like the true one (McSherry and Talwar, FOCS 2007).
+"""Exponential: words with a likelihood that grows with their similarity to the true one (McSherry and Talwar, FOCS 2007).
 
 The utility of a word w for the true word v, the one nearest to the descriptor, is their cosine: 0 up to `floor`, 1 at cosine 1,
-straight between, and rounded down to one of `levels` + 1 values. One word is drawn with
+linear between, and rounded down to one of `levels` + 1 values. One word is drawn with
 
     Pr(w | v) = e^(ε u(v, w) / 2) / N(v),    N(v) = Σ_w e^(ε u(v, w) / 2).
 
-*It is ε-LDP:* u lies in [0, 1], so that e^(ε u(v, w) / 2) differs by the factor e^(ε / 2) at most from one v to another. So
-does each term of N, and hence N. The quotient of the two differs by e^ε at most. ∎ The 2 is the price of normalisers that
-differ: `plateau` has equal ones and does without.
+*It is ε-LDP:* u lies in [0, 1], so e^(ε u(v, w) / 2) changes by at most the factor e^(ε / 2) from one v to another. So
+does each term of N, and hence N. The quotient of the two changes by at most e^ε. ∎ The factor 2 is due to normalisers that
+differ: `plateau` has equal ones and does not need it.
 
-For m words, they are drawn one after the other, each from those that are left, with ε / m each. Given those before, each is this
-very mechanism on fewer words, so that the m of them compose to ε. Which came first is not told.
+m words are drawn one at a time without replacement, with ε / m each. Given the earlier ones, each is this mechanism on fewer
+words, so the m of them compose to ε. The order of the draws is not released.
 
-Nothing in the proof rests on how u is rounded, as long as it is a function of v and w; here it is one of whole numbers,
-whatever the machine (`bench.geometry.neighbours`). The draw is exact (`bench.mechanisms.graded`), in blocks of words, one pass over
-the dictionary.
+The proof does not depend on the rounding of u, as long as u is a function of v and w. Here it is a function of integers, the same
+on every machine (`bench.geometry.neighbours`). The draw is exact (`bench.mechanisms.graded`): one pass over the dictionary.
 """
 
 from __future__ import annotations
@@ -26,19 +25,20 @@ from typing import ClassVar
 
 import numpy as np
 
-from bench.api import Asset, Between, Defense, OneOf, Privacy
+from bench.api import Defense, Privacy
 from bench.codebook.dictionary import Dictionary
 from bench.codebook.public import Public
 from bench.core.errors import UserError
-from bench.core.exact import exact
+from bench.core.exact import to_fraction
 from bench.geometry.nearest_words import unit_rows
-from bench.mechanisms.graded import graded_words
-from bench.types import Features, WordSets
+from bench.mechanisms.graded import draw_graded_words
+from bench.settings import Asset, Between, OneOf
+from bench.types import Features, Points, WordSets
 
 
 @dataclass(frozen=True, kw_only=True)
 class Exponential(Defense):
-    """Releases words that are the likelier, the greater their cosine with the descriptor's nearest word."""
+    """Releases words with a likelihood that grows with their cosine with the descriptor's nearest word."""
 
     releases = WordSets
     supported_settings: ClassVar[Mapping[str, Between | OneOf]] = {"epsilon": Between(8.0, 32.0), "words": OneOf((0, 128_000))}
@@ -46,11 +46,11 @@ class Exponential(Defense):
     word_count_field: ClassVar[str | None] = "words"
 
     epsilon: float = 10.0  # nats, per descriptor
-    subset_size: int = 1  # words released per keypoint, with epsilon / subset_size each
-    floor: float = 0.8  # the cosine up to which a word is of no use; most are below it
-    levels: int = 8  # of utility, beside 0
+    subset_size: int = 1  # words released per keypoint, each with epsilon / subset_size
+    floor: float = 0.8  # the greatest cosine of utility 0; most words are below it
+    levels: int = 8  # of utility, besides 0
     dictionary: Asset = Asset("shipped")
-    words: int = 0  # how many of the dictionary's words are used at most, from its first on; 0 is all
+    words: int = 0  # number of the dictionary's first words to use; 0 is all
 
     def __post_init__(self) -> None:
         if not (self.epsilon >= 0 and math.isfinite(self.epsilon)):  # NaN is refused too
@@ -63,25 +63,25 @@ class Exponential(Defense):
             raise UserError(f"exponential: words must be 0 for all, or at least 2, got {self.words}")
 
     def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> WordSets:
-        known = self._known(public)
+        dictionary = self._load_dictionary(public)
         true = public.nearest_words(self.dictionary, secret, self.words)  # (N,)
-        # A word's cosine with itself may be rounded to below 1.
+        # Rounding may put a word's cosine with itself below 1.
         borders = self.floor + (1 - self.floor) * np.arange(1, self.levels + 1) / self.levels - 1e-9
-        powers = [exact(self.epsilon) * level / (2 * self.levels * self.subset_size) for level in range(self.levels + 1)]
-        words = graded_words(known.neighbours, true, borders, powers, self.subset_size, rng)
-        candidates = unit_rows(known.words[words])  # (N, m, D)
-        return WordSets(keypoints=secret.keypoints.copy(), size=secret.size, candidates=candidates, words=words)
+        powers = [to_fraction(self.epsilon) * level / (2 * self.levels * self.subset_size) for level in range(self.levels + 1)]
+        words = draw_graded_words(dictionary.neighbours, true, borders, powers, self.subset_size, rng)
+        candidates = unit_rows(dictionary.words[words])  # (N, m, D)
+        return WordSets(positions=Points(keypoints=secret.keypoints.copy()), size=secret.size, candidates=candidates, words=words)
 
     def privacy(self, public: Public) -> Privacy:
-        self._known(public)
-        return Privacy("epsilon-ldp", self.epsilon)  # the chance of the true word is another for each word
+        self._load_dictionary(public)
+        return Privacy("epsilon-ldp", self.epsilon)  # the chance of the true word differs between words
 
-    def _known(self, public: Public) -> Dictionary:
-        """The dictionary, once it is known to hold enough words."""
-        known = public.dictionary(self.dictionary, self.words)
-        if len(known) < self.subset_size:
-            raise UserError(f"exponential: subset_size is {self.subset_size}, but the dictionary has {len(known)} words")
-        return known
+    def _load_dictionary(self, public: Public) -> Dictionary:
+        """Load the dictionary and check that it has enough words."""
+        dictionary = public.dictionary(self.dictionary, self.words)
+        if len(dictionary) < self.subset_size:
+            raise UserError(f"exponential: subset_size is {self.subset_size}, but the dictionary has {len(dictionary)} words")
+        return dictionary
 
 
 PLUGIN = Exponential

@@ -1,8 +1,8 @@
 """LDP-Feat: the ω-subset mechanism on a dictionary of descriptors (Sec. 5.2, Steps 1 to 3; Eq. (5); Theorem 1).
 
-With `memoize`, one answer is drawn for each word of the dictionary, and a device gives it whenever the word comes up. All that a
-device ever sends is then a function of its table of answers, so a word costs ε once, however often it is sent. In return equal
-words are seen to be equal, in one photograph and from one to the next, which no ε covers (docs/guarantee.md).
+With `memoize`, one answer is drawn for each word of the dictionary, and a device always sends that answer for the word. All
+releases of a device are then a function of its table of answers, so a word costs ε once, regardless of the number of releases. In
+return, equal words are visibly equal within and across photographs, which no ε covers (docs/guarantee.md).
 """
 
 from __future__ import annotations
@@ -14,20 +14,21 @@ from typing import ClassVar
 
 import numpy as np
 
-from bench.api import Asset, Between, Defense, OneOf, Privacy
+from bench.api import Defense, Privacy
 from bench.codebook.dictionary import Dictionary
 from bench.codebook.public import Public
 from bench.core.errors import UserError
 from bench.geometry.nearest_words import unit_rows
-from bench.mechanisms.subset import log10_chance, word_subsets
-from bench.types import Features, WordSets
+from bench.mechanisms.subset import draw_word_subsets, log10_chance
+from bench.settings import Asset, Between, OneOf
+from bench.types import Features, Points, WordSets
 
 
 @dataclass(frozen=True, kw_only=True)
 class LDP(Defense):
-    """Releases a random set of words, the descriptor's nearest among them with a probability that epsilon sets.
+    """Releases a random set of words that contains the descriptor's nearest word with a probability set by epsilon.
 
-    `epsilon=inf` always releases the nearest word, with `subset_size` - 1 random ones: quantisation, and no guarantee.
+    `epsilon=inf` always releases the nearest word, with `subset_size` - 1 random ones: quantisation without a guarantee.
     """
 
     releases = WordSets
@@ -42,7 +43,7 @@ class LDP(Defense):
     epsilon: float = 10.0  # nats, per descriptor
     subset_size: int = 2  # words released per keypoint
     dictionary: Asset = Asset("shipped")
-    words: int = 0  # how many of the dictionary's words are used at most, from its first on; 0 is all
+    words: int = 0  # number of the dictionary's first words to use; 0 is all
     memoize: bool = False  # whether a word always gets the same answer on one device
 
     def __post_init__(self) -> None:
@@ -54,18 +55,18 @@ class LDP(Defense):
             raise UserError(f"ldp: words must be 0 for all, or at least 2, got {self.words}")
 
     def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> WordSets:
-        known = self._known(public)
+        dictionary = self._load_dictionary(public)
         nearest = public.nearest_words(self.dictionary, secret, self.words)  # (N,) d'
-        # A device that remembers draws its answers to all words, whichever it is asked for.
-        asked = np.arange(len(known)) if self.memoize else nearest
-        answers = word_subsets(asked, len(known), self.epsilon, self.subset_size, rng)
+        # A memoized defense draws its answers to all words, regardless of the features.
+        inputs = np.arange(len(dictionary)) if self.memoize else nearest
+        answers = draw_word_subsets(inputs, len(dictionary), self.epsilon, self.subset_size, rng)
         words = answers[nearest] if self.memoize else answers  # (N, m)
-        distinct, places = np.unique(words, return_inverse=True)
-        candidates = unit_rows(known.words[distinct])[places.reshape(words.shape)]  # (N, m, D)
-        return WordSets(keypoints=secret.keypoints.copy(), size=secret.size, candidates=candidates, words=words)
+        distinct, inverse = np.unique(words, return_inverse=True)
+        candidates = unit_rows(dictionary.words[distinct])[inverse.reshape(words.shape)]  # (N, m, D)
+        return WordSets(positions=Points(keypoints=secret.keypoints.copy()), size=secret.size, candidates=candidates, words=words)
 
     def privacy(self, public: Public) -> Privacy:
-        log10_true = log10_chance(self.epsilon, len(self._known(public)), self.subset_size)
+        log10_true = log10_chance(self.epsilon, len(self._load_dictionary(public)), self.subset_size)
         if math.isinf(self.epsilon):
             return Privacy("none", log10_true=log10_true)
         return Privacy("epsilon-ldp-by-word" if self.memoize else "epsilon-ldp", self.epsilon, log10_true)
@@ -73,12 +74,12 @@ class LDP(Defense):
     def is_memoized(self) -> bool:
         return self.memoize
 
-    def _known(self, public: Public) -> Dictionary:
-        """The dictionary, once it is known to hold enough words."""
-        known = public.dictionary(self.dictionary, self.words)
-        if len(known) < self.subset_size:
-            raise UserError(f"ldp: subset_size is {self.subset_size}, but the dictionary has {len(known)} words")
-        return known
+    def _load_dictionary(self, public: Public) -> Dictionary:
+        """Load the dictionary and check that it has enough words."""
+        dictionary = public.dictionary(self.dictionary, self.words)
+        if len(dictionary) < self.subset_size:
+            raise UserError(f"ldp: subset_size is {self.subset_size}, but the dictionary has {len(dictionary)} words")
+        return dictionary
 
 
 PLUGIN = LDP

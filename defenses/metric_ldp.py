@@ -1,22 +1,22 @@
 """Metric LDP: d_χ-privacy over words (Chatzikokolakis et al., PETS 2013; for embeddings Feyisetan et al., WSDM 2020).
 
-A promise of another kind than ε-LDP: how well two descriptors are hidden among each other depends on how far they are apart.
+A different guarantee than ε-LDP: the protection of two descriptors against each other depends on their distance.
 With ε in nats *per unit of distance*,
 
     Pr(w | v1) ≤ e^(ε d(v1, v2)) Pr(w | v2)    for all words w, and v1, v2 the words nearest to the two descriptors.
 
-Descriptors that are alike are hidden among each other; that a descriptor is of one kind and not of another is hidden no better
-than the distance between the kinds allows, and √2, that of SIFT descriptors that share no direction, is the most there is.
-Numbers of ε in nats and in nats per distance have nothing to do with each other.
+Similar descriptors are hidden among each other. Whether a descriptor is of one kind or another is hidden no better than the
+distance between the kinds allows. The greatest distance is √2, that of SIFT descriptors with no direction in common. Values of ε
+in nats and in nats per distance are not comparable.
 
 One word is drawn, with Pr(w | v) = e^(−ε d(v, w) / 2) / N(v). d is the distance of the unit words, rounded up to a multiple of
-1/`steps`. That is a metric again: rounding up keeps zero and order, and ⌈a + b⌉ ≤ ⌈a⌉ + ⌈b⌉.
+1/`steps`. It is a metric: rounding up preserves zero and order, and ⌈a + b⌉ ≤ ⌈a⌉ + ⌈b⌉.
 
-*Proof.* |d(v1, w) − d(v2, w)| ≤ d(v1, v2), so that numerators differ by the factor e^(ε d(v1, v2) / 2) at most, and so do the
-terms of N, and N; the quotient by e^(ε d(v1, v2)). ∎
+*Proof.* |d(v1, w) − d(v2, w)| ≤ d(v1, v2), so numerators differ by at most the factor e^(ε d(v1, v2) / 2), and so do the
+terms of N, and N. The quotient differs by at most e^(ε d(v1, v2)). ∎
 
-Distances are computed from whole numbers, to within `SLACK`; the metric of the promise is the distance plus twice that, rounded
-up, which covers that a rounded distance falls on the wrong side of a step. The draw is exact (`bench.mechanisms.graded`).
+Distances are computed from integers, to within `SLACK`. The metric of the guarantee is the distance plus 2 `SLACK`, rounded up:
+this covers distances that rounding puts on the wrong side of a step. The draw is exact (`bench.mechanisms.graded`).
 """
 
 from __future__ import annotations
@@ -29,22 +29,23 @@ from typing import ClassVar
 
 import numpy as np
 
-from bench.api import Asset, Between, Defense, OneOf, Privacy
+from bench.api import Defense, Privacy
 from bench.codebook.public import Public
 from bench.core.errors import UserError
-from bench.core.exact import exact
+from bench.core.exact import to_fraction
 from bench.geometry.nearest_words import unit_rows
-from bench.mechanisms.graded import graded_words
-from bench.types import Features, WordSets
+from bench.mechanisms.graded import draw_graded_words
+from bench.settings import Asset, Between, OneOf
+from bench.types import Features, Points, WordSets
 
-SLACK = 2e-6  # of distance: cosines are off by 1e-15, and what is nearer to 1 than TOGETHER has distance zero
-TOGETHER = 1e-12
-FARTHEST = 2  # between unit vectors
+SLACK = 2e-6  # of distance: cosines are off by 1e-15, and cosines nearer to 1 than ZERO_TOLERANCE have distance zero
+ZERO_TOLERANCE = 1e-12
+FARTHEST = 2  # greatest distance of unit vectors
 
 
 @dataclass(frozen=True, kw_only=True)
 class MetricLDP(Defense):
-    """Releases a word that is the likelier, the nearer it is to the descriptor's nearest word; a promise by distance."""
+    """Releases a word with a likelihood that falls with its distance to the descriptor's nearest word."""
 
     releases = WordSets
     supported_settings: ClassVar[Mapping[str, Between | OneOf]] = {"epsilon": Between(10.0, 80.0), "words": OneOf((0, 128_000))}
@@ -52,9 +53,9 @@ class MetricLDP(Defense):
     word_count_field: ClassVar[str | None] = "words"
 
     epsilon: float = 16.0  # nats per unit of distance between unit descriptors
-    steps: int = 16  # in a unit of distance
+    steps: int = 16  # per unit of distance
     dictionary: Asset = Asset("shipped")
-    words: int = 0  # how many of the dictionary's words are used at most, from its first on; 0 is all
+    words: int = 0  # number of the dictionary's first words to use; 0 is all
 
     def __post_init__(self) -> None:
         if not (self.epsilon >= 0 and math.isfinite(self.epsilon)):  # NaN is refused too
@@ -65,28 +66,28 @@ class MetricLDP(Defense):
             raise UserError(f"metric-ldp: words must be 0 for all, or at least 2, got {self.words}")
 
     def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> WordSets:
-        known = public.dictionary(self.dictionary, self.words)
+        dictionary = public.dictionary(self.dictionary, self.words)
         true = public.nearest_words(self.dictionary, secret, self.words)  # (N,)
         most = FARTHEST * self.steps  # steps to the farthest word
         distances = np.arange(most)[::-1] / self.steps
-        borders = 1 - distances**2 / 2 - TOGETHER  # |a − b|² = 2 − 2 cos, ascending
-        powers = [-exact(self.epsilon) * (most - level) / (2 * self.steps) for level in range(most + 1)]
-        words = graded_words(known.neighbours, true, borders, powers, 1, rng)
-        candidates = unit_rows(known.words[words])  # (N, 1, D)
-        return WordSets(keypoints=secret.keypoints.copy(), size=secret.size, candidates=candidates, words=words)
+        borders = 1 - distances**2 / 2 - ZERO_TOLERANCE  # |a − b|² = 2 − 2 cos, ascending
+        powers = [-to_fraction(self.epsilon) * (most - level) / (2 * self.steps) for level in range(most + 1)]
+        words = draw_graded_words(dictionary.neighbours, true, borders, powers, 1, rng)
+        candidates = unit_rows(dictionary.words[words])  # (N, 1, D)
+        return WordSets(positions=Points(keypoints=secret.keypoints.copy()), size=secret.size, candidates=candidates, words=words)
 
     def privacy(self, public: Public) -> Privacy:
         public.dictionary(self.dictionary, self.words)
         return Privacy("d-chi", per_distance=self.epsilon)
 
     def distance(self, secret: Features, public: Public, one: int, other: int) -> Fraction:
-        known = public.dictionary(self.dictionary, self.words)
+        dictionary = public.dictionary(self.dictionary, self.words)
         words = public.nearest_words(self.dictionary, secret.take(np.array([one, other])), self.words)
         if words[0] == words[1]:
             return Fraction(0)
-        first, second = known.words[words].astype(np.float64)
-        apart = float(np.linalg.norm(first / np.linalg.norm(first) - second / np.linalg.norm(second)))
-        return Fraction(math.ceil((apart + 2 * SLACK) * self.steps), self.steps)
+        first, second = dictionary.words[words].astype(np.float64)
+        distance = float(np.linalg.norm(first / np.linalg.norm(first) - second / np.linalg.norm(second)))
+        return Fraction(math.ceil((distance + 2 * SLACK) * self.steps), self.steps)
 
 
 PLUGIN = MetricLDP

@@ -1,7 +1,7 @@
 """Naive LDP: the ω-subset mechanism on the full descriptor space (Sec. 5.2, "Naive Approach").
 
 K is the set of all bit patterns of a descriptor: |K| = 2^(8·128) for uint8, 2^(32·128) for float32. The mechanism draws
-patterns; what follows, reading them as descriptors, sees nothing but its output and so costs no privacy.
+patterns. Reading them as descriptors is post-processing and costs no privacy.
 
 Rule for patterns that are no descriptor: a component that is NaN or infinite is read as 0; the row is then scaled to unit
 norm in float64; a row of zeros stays zero.
@@ -19,10 +19,10 @@ from bench.api import Defense, Privacy
 from bench.codebook.public import Public
 from bench.core.errors import UserError
 from bench.geometry.nearest_words import unit_rows
-from bench.mechanisms.subset import log10_chance, pattern_subsets
-from bench.types import Bytes, Features, Floats, WordSets
+from bench.mechanisms.subset import draw_pattern_subsets, log10_chance
+from bench.types import Bytes, Features, Floats, Points, WordSets
 
-LENGTH = 128  # of a descriptor; |K| rests on it
+LENGTH = 128  # of a descriptor; |K| depends on it
 BITS = {"uint8": 8, "float32": 32}
 
 
@@ -34,7 +34,7 @@ class NaiveLDP(Defense):
 
     epsilon: float = 10.0  # nats, per descriptor
     subset_size: int = 2  # patterns released per keypoint
-    element: Literal["uint8", "float32"] = "uint8"  # what a descriptor is made of
+    element: Literal["uint8", "float32"] = "uint8"  # type of a descriptor's components
 
     def __post_init__(self) -> None:
         if not self.epsilon >= 0:  # NaN is refused too
@@ -45,9 +45,9 @@ class NaiveLDP(Defense):
             raise UserError(f"naive-ldp: element must be uint8 or float32, got {self.element}")
 
     def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> WordSets:
-        patterns = pattern_subsets(self._patterns(secret), self.epsilon, self.subset_size, rng)  # (N, m, B)
-        candidates = unit_rows(patterns if self.element == "uint8" else finite_floats(patterns))  # (N, m, D)
-        return WordSets(keypoints=secret.keypoints.copy(), size=secret.size, candidates=candidates, words=None)
+        patterns = draw_pattern_subsets(self._encode_patterns(secret), self.epsilon, self.subset_size, rng)  # (N, m, B)
+        candidates = unit_rows(patterns if self.element == "uint8" else read_finite_floats(patterns))  # (N, m, D)
+        return WordSets(positions=Points(keypoints=secret.keypoints.copy()), size=secret.size, candidates=candidates, words=None)
 
     def privacy(self, public: Public) -> Privacy:
         log10_true = log10_chance(self.epsilon, 2 ** (BITS[self.element] * LENGTH), self.subset_size)
@@ -55,8 +55,8 @@ class NaiveLDP(Defense):
             return Privacy("none", log10_true=log10_true)
         return Privacy("epsilon-ldp", self.epsilon, log10_true)
 
-    def _patterns(self, secret: Features) -> Bytes:
-        """The descriptors as bytes. -> (N, B)"""
+    def _encode_patterns(self, secret: Features) -> Bytes:
+        """Return the descriptors as bytes. -> (N, B)"""
         if secret.descriptors.shape[1] != LENGTH:
             raise UserError(f"naive-ldp: descriptors must have length {LENGTH}, got {secret.descriptors.shape[1]}")
         if self.element == "float32":
@@ -66,7 +66,7 @@ class NaiveLDP(Defense):
         return secret.codes
 
 
-def finite_floats(patterns: Bytes) -> Floats:
+def read_finite_floats(patterns: Bytes) -> Floats:
     """Read patterns as float32, NaN and infinities as 0. (N, m, 4 D) -> (N, m, D)"""
     values = patterns.view("<f4")
     return np.where(np.isfinite(values), values, np.float32(0))

@@ -10,14 +10,14 @@ import numpy as np
 from bench.api import Defense, Privacy
 from bench.codebook.public import Public
 from bench.core.errors import UserError
-from bench.types import Descriptors, Features, Floats
+from bench.types import Descriptors, Features, Floats, Points
 
 COLUMNS = {"positions": 0, "scale": 1, "scale-and-orientation": 2}  # of `Features.frames`
 
 
 @dataclass(frozen=True, kw_only=True)
 class Undefended(Defense):
-    """Releases the descriptors as they are.
+    """Releases the descriptors unchanged.
 
     Clients may send more of a keypoint than its position: COLMAP's and hloc's files carry scale and orientation.
     """
@@ -32,18 +32,18 @@ class Undefended(Defense):
 
     def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> Descriptors:
         return Descriptors(
-            keypoints=secret.keypoints.copy(),
+            positions=Points(keypoints=secret.keypoints.copy()),
             size=secret.size,
             descriptors=secret.descriptors.copy(),
-            frames=self._frames(secret),
+            frames=self._select_frames(secret),
         )
 
-    def _frames(self, secret: Features) -> Floats | None:
+    def _select_frames(self, secret: Features) -> Floats | None:
         columns = COLUMNS[self.sends]
         if columns == 0:
             return None
         if secret.frames is None:
-            raise UserError(f"none: sends={self.sends}, but the extractor does not tell it")
+            raise UserError(f"none: sends={self.sends}, but the extractor does not provide it")
         return secret.frames[:, :columns].copy()
 
     def privacy(self, public: Public) -> Privacy:

@@ -1,21 +1,20 @@
-"""Plateau: a set of words that is likelier, by e^ε, if it holds the true word or one of those nearest to it.
+"""Plateau: a set of words that is likelier, by e^ε, if it contains the true word or one of its nearest words.
 
 Let T(v) be the t words nearest to v, itself among them, and v the word nearest to the descriptor. Of all sets Z of m words,
 
-    Pr(Z | v) = e^ε / (A e^ε + B)   if Z and T(v) have a word in common,    A = C(|K|, m) − C(|K| − t, m) sets,
-    Pr(Z | v) = 1   / (A e^ε + B)   if they have none,                      B = C(|K| − t, m) sets.
+    Pr(Z | v) = e^ε / (A e^ε + B)   if Z and T(v) share a word,             A = C(|K|, m) − C(|K| − t, m) sets,
+    Pr(Z | v) = 1   / (A e^ε + B)   if they do not,                         B = C(|K| − t, m) sets.
 
-*It is ε-LDP:* t is the same for all v, and so are A and B; the two values differ by the factor e^ε, and there are no others.
-T(v) is a function of v, v one of the descriptor, and the same bound holds for descriptors. ∎ With t = 1 this is `ldp`, word for
-word.
+*It is ε-LDP:* t is the same for all v, and so are A and B; the only two values differ by the factor e^ε. T(v)
+is a function of v, and v one of the descriptor, so the same bound holds for descriptors. ∎ With t = 1 this is exactly `ldp`.
 
-The ω-subset mechanism tells the true word and spends the rest on words that are drawn from all alike. Here the words near the
-true one are as likely as it is. Where p is small, each is told nearly as often as `ldp` tells the true one: with m t e^ε well
-below |K|, t costs the true word little, and where p is large, much. A server that meets the descriptor again may quantise it to
-a near word; an attacker likes a near word almost as much as the true one. docs/better.md measures both.
+The other words of an ω-subset are drawn uniformly. Here the words near the true one are as likely as it is. Where p is small,
+each is released nearly as often as the true one by `ldp`: with m t e^ε well below |K|, t costs the true word little; where p is
+large, much. A server may quantise the same descriptor to a near word later; for an attacker, a near word is almost as useful as
+the true one. docs/better.md measures both.
 
-Sampled exactly: whether Z meets T(v) as `ldp` samples u, with the whole numbers A + B and A for |K| and m; how many words they
-share, of C(t, j) C(|K| − t, m − j) sets each; and then subsets of both, without replacement. Rows come out sorted.
+The sampling is exact. Whether Z and T(v) share a word is drawn as u in `ldp`, with the integers A + B and A for |K| and m; then
+the number j of shared words, of C(t, j) C(|K| − t, m − j) sets each; then subsets of both, without replacement. Rows are sorted.
 """
 
 from __future__ import annotations
@@ -28,19 +27,20 @@ from typing import ClassVar
 
 import numpy as np
 
-from bench.api import Asset, Between, Defense, OneOf, Privacy
+from bench.api import Defense, Privacy
 from bench.codebook.dictionary import Dictionary
 from bench.codebook.public import Public
 from bench.core.errors import UserError
 from bench.geometry.nearest_words import unit_rows
 from bench.mechanisms.classes import draw_classes
-from bench.mechanisms.subset import draw_distinct, draw_told, log10_chance
-from bench.types import Features, Indices, WordSets
+from bench.mechanisms.subset import draw_distinct, draw_inclusion, log10_chance
+from bench.settings import Asset, Between, OneOf
+from bench.types import Features, Indices, Points, WordSets
 
 
 @dataclass(frozen=True, kw_only=True)
 class Plateau(Defense):
-    """Releases a random set of words, likelier if it holds the descriptor's nearest word or one near to that."""
+    """Releases a random set of words, likelier if it contains the descriptor's nearest word or a word near that one."""
 
     releases = WordSets
     supported_settings: ClassVar[Mapping[str, Between | OneOf]] = {
@@ -54,9 +54,9 @@ class Plateau(Defense):
 
     epsilon: float = 10.0  # nats, per descriptor
     subset_size: int = 2  # words released per keypoint
-    near: int = 4  # words of the plateau, the true one among them
+    near: int = 4  # words of the plateau, including the true one
     dictionary: Asset = Asset("shipped")
-    words: int = 0  # how many of the dictionary's words are used at most, from its first on; 0 is all
+    words: int = 0  # number of the dictionary's first words to use; 0 is all
 
     def __post_init__(self) -> None:
         if not self.epsilon >= 0:  # NaN is refused too
@@ -67,52 +67,54 @@ class Plateau(Defense):
             raise UserError(f"plateau: words must be 0 for all, or at least 2, got {self.words}")
 
     def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> WordSets:
-        known = self._known(public)
+        dictionary = self._load_dictionary(public)
         true = public.nearest_words(self.dictionary, secret, self.words)  # (N,)
-        words = plateau_subsets(known.neighbours.nearest(true, self.near), len(known), self.epsilon, self.subset_size, rng)
-        candidates = unit_rows(known.words[words])  # (N, m, D)
-        return WordSets(keypoints=secret.keypoints.copy(), size=secret.size, candidates=candidates, words=words)
+        words = draw_plateau_subsets(
+            dictionary.neighbours.find_nearest(true, self.near), len(dictionary), self.epsilon, self.subset_size, rng
+        )
+        candidates = unit_rows(dictionary.words[words])  # (N, m, D)
+        return WordSets(positions=Points(keypoints=secret.keypoints.copy()), size=secret.size, candidates=candidates, words=words)
 
     def privacy(self, public: Public) -> Privacy:
-        domain = len(self._known(public))
-        meeting = _meeting(domain, self.near, self.subset_size)
-        holding = Fraction(math.comb(domain - 1, self.subset_size - 1), meeting)  # the true word, of those sets that meet T
-        log10_true = log10_chance(self.epsilon, math.comb(domain, self.subset_size), meeting) + math.log10(holding)
+        domain = len(self._load_dictionary(public))
+        intersecting = _count_intersecting_sets(domain, self.near, self.subset_size)
+        fraction = Fraction(math.comb(domain - 1, self.subset_size - 1), intersecting)  # of these sets, with the true word
+        log10_true = log10_chance(self.epsilon, math.comb(domain, self.subset_size), intersecting) + math.log10(fraction)
         if math.isinf(self.epsilon):
             return Privacy("none", log10_true=log10_true)
         return Privacy("epsilon-ldp", self.epsilon, log10_true)
 
-    def _known(self, public: Public) -> Dictionary:
-        """The dictionary, once it is known to hold enough words."""
-        known = public.dictionary(self.dictionary, self.words)
-        if len(known) < max(self.subset_size, self.near):
+    def _load_dictionary(self, public: Public) -> Dictionary:
+        """Load the dictionary and check that it has enough words."""
+        dictionary = public.dictionary(self.dictionary, self.words)
+        if len(dictionary) < max(self.subset_size, self.near):
             raise UserError(
-                f"plateau: subset_size is {self.subset_size} and near {self.near}, but the dictionary has {len(known)} words"
+                f"plateau: subset_size is {self.subset_size} and near {self.near}, but the dictionary has {len(dictionary)} words"
             )
-        return known
+        return dictionary
 
 
-def _meeting(domain: int, near: int, size: int) -> int:
-    """A: how many sets of `size` words have one of the plateau."""
+def _count_intersecting_sets(domain: int, near: int, size: int) -> int:
+    """Return A, the number of sets of `size` words with a word of the plateau."""
     return math.comb(domain, size) - math.comb(domain - near, size)
 
 
-def plateau_subsets(plateaus: Indices, domain: int, epsilon: float, size: int, rng: np.random.Generator) -> Indices:
+def draw_plateau_subsets(plateaus: Indices, domain: int, epsilon: float, size: int, rng: np.random.Generator) -> Indices:
     """The mechanism on K = {0, ..., domain − 1}. plateaus: (N, t), rows ascending -> (N, m), rows ascending"""
     rows, near = plateaus.shape
     shared = np.zeros(rows, dtype=np.int64)  # words of the plateau in each set
-    met = draw_told(rows, epsilon, math.comb(domain, size), _meeting(domain, near, size), rng)
+    intersecting = draw_inclusion(rows, epsilon, math.comb(domain, size), _count_intersecting_sets(domain, near, size), rng)
     ways = [math.comb(near, j) * math.comb(domain - near, size - j) for j in range(1, min(near, size) + 1)]
-    shared[met] = 1 + draw_classes([ways], [Fraction(0)] * len(ways), np.zeros(met.sum(), dtype=np.int64), rng)
+    shared[intersecting] = 1 + draw_classes([ways], [Fraction(0)] * len(ways), np.zeros(intersecting.sum(), dtype=np.int64), rng)
     words = np.empty((rows, size), dtype=np.int64)
     for j in np.unique(shared):
-        here = np.flatnonzero(shared == j)
-        inside = draw_distinct(len(here), near, int(j), rng)  # (n, j) of the t
-        others = draw_distinct(len(here), domain - near, size - int(j), rng)  # (n, m − j) of the |K| − t that remain
-        for word in plateaus[here].T:
+        members = np.flatnonzero(shared == j)
+        inside = draw_distinct(len(members), near, int(j), rng)  # (n, j) of the t
+        others = draw_distinct(len(members), domain - near, size - int(j), rng)  # (n, m − j) of the other |K| − t
+        for word in plateaus[members].T:
             others += others >= word[:, None]
-        words[here, :j] = np.take_along_axis(plateaus[here], inside, axis=1)
-        words[here, j:] = others
+        words[members, :j] = np.take_along_axis(plateaus[members], inside, axis=1)
+        words[members, j:] = others
     return np.sort(words, axis=1)
 
 

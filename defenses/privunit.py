@@ -1,6 +1,6 @@
 """PrivUnit: a unit vector that is likelier, by e^ε, within a cap around the descriptor (Bhowmick et al., arXiv:1812.00984).
 
-Let u be a unit vector of S^(n − 1), and q the share of the sphere that the cap {v: v·u ≥ γ} covers. With probability
+Let u be a unit vector of S^(n − 1), and q the fraction of the sphere that the cap {v: v·u ≥ γ} covers. With probability
 
     p = q e^ε / (q e^ε + 1 − q)
 
@@ -9,19 +9,18 @@ v is uniform on the cap, else on the rest. Its density, relative to the uniform 
     p / q             = e^ε / (q e^ε + 1 − q)    within the cap,
     (1 − p) / (1 − q) = 1   / (q e^ε + 1 − q)    outside.
 
-*It is ε-LDP:* all caps of one γ cover the same share, so the two densities are the same for all u; they differ by the factor
-e^ε, and there are no others. ∎ Spending all of ε on this quotient, and choosing γ so that the mean of v·u is greatest, is
-optimal among all unbiased mechanisms (Asi, Feldman and Talwar, ICML 2022); the original splits ε in two. `plateau` is the same
-over words.
+*It is ε-LDP:* all caps of one γ cover the same fraction, so the two densities are the same for all u. They are the only ones
+and differ by the factor e^ε. ∎ Spending all of ε on this quotient, and choosing γ so that the mean of v·u is greatest, is
+optimal among all unbiased mechanisms (Asi, Feldman and Talwar, ICML 2022); the original splits ε in two. `plateau` is the
+analogue for words.
 
-Descriptors have nothing negative and crowd about their mean. With `centred`, u is what of the descriptor is at right angles to
-the mean direction of a public dictionary, and n is one less; a function of the descriptor, so nothing of the proof changes.
+Descriptors are non-negative and cluster around their mean. With `centred`, u is the component of the descriptor orthogonal to the
+mean direction of a public dictionary, and n is one less. It is a function of the descriptor, so the proof still holds.
 
-The coin is exact, with q a multiple of 2^-64 (`bench.mechanisms.subset`). The vector is not: a sphere has no exact draw. γ and the
-projection are doubles, which move the densities by about 1e-12 of themselves; and each number of the result is rounded to a
-multiple of 2^-12 before it is scaled to unit norm, which cuts off the bits in which sums of doubles tell what they are sums of
-(Mironov, CCS 2012). So ε is kept as far as doubles can be taken for real numbers, and not beyond, as it is by mechanisms over
-words.
+The coin is exact, with q a multiple of 2^-64 (`bench.mechanisms.subset`). The vector is not: a sphere has no exact draw. γ and
+the projection are doubles, with a relative error of the densities of about 1e-12. Each component is rounded to a multiple of
+2^-12 before it is scaled to unit norm. This removes the bits in which sums of doubles reveal their summands (Mironov, CCS 2012). So ε
+holds as far as doubles represent real numbers, whereas mechanisms over words are exact.
 """
 
 from __future__ import annotations
@@ -37,17 +36,18 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from scipy.special import betainc, betaincinv, betaln
 
-from bench.api import Asset, Between, Defense, OneOf, Privacy
+from bench.api import Defense, Privacy
 from bench.codebook.public import Public
 from bench.core.errors import UserError
 from bench.geometry.nearest_words import unit_rows
-from bench.mechanisms.subset import draw_told
-from bench.types import Descriptors, Features
+from bench.mechanisms.subset import draw_inclusion
+from bench.settings import Asset, Between, OneOf
+from bench.types import Descriptors, Features, Points
 
 Doubles = NDArray[np.float64]
 
-PLACES = 64  # binary, of q
-GRID = 2.0**-12  # of the numbers that are released
+BINARY_DIGITS = 64  # of q
+GRID = 2.0**-12  # of the released components, before scaling
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +59,7 @@ class PrivUnit(Defense):
     noisy: ClassVar[bool] = True
 
     epsilon: float = 10.0  # nats, per descriptor
-    centred: bool = True  # whether the mean direction of the dictionary's words is taken out first
+    centred: bool = True  # whether the mean direction of the dictionary's words is removed first
     dictionary: Asset = Asset("shipped")
 
     def __post_init__(self) -> None:
@@ -68,47 +68,47 @@ class PrivUnit(Defense):
 
     def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> Descriptors:
         mean = public.dictionary(self.dictionary).mean[None] if self.centred else None  # (1, D)
-        drawn = near(without(secret.descriptors.astype(np.float64), mean), mean, self.epsilon, rng)
-        released = unit_rows((np.rint(drawn / GRID) * GRID).astype(np.float32))
-        return Descriptors(keypoints=secret.keypoints.copy(), size=secret.size, descriptors=released)
+        vectors = draw_near(remove_mean(secret.descriptors.astype(np.float64), mean), mean, self.epsilon, rng)
+        released = unit_rows((np.rint(vectors / GRID) * GRID).astype(np.float32))
+        return Descriptors(positions=Points(keypoints=secret.keypoints.copy()), size=secret.size, descriptors=released)
 
     def privacy(self, public: Public) -> Privacy:
         return Privacy("epsilon-ldp", self.epsilon)
 
 
-def without(rows: Doubles, mean: Doubles | None) -> Doubles:
-    """Unit vectors along what of each row is at right angles to the mean. (N, D), (1, D) -> (N, D)"""
+def remove_mean(rows: Doubles, mean: Doubles | None) -> Doubles:
+    """Return unit vectors along the component of each row orthogonal to the mean. (N, D), (1, D) -> (N, D)"""
     if mean is not None:
         rows = rows - (rows @ mean.T) * mean
     return rows / np.linalg.norm(rows, axis=1, keepdims=True)
 
 
-def near(u: Doubles, mean: Doubles | None, epsilon: float, rng: np.random.Generator) -> Doubles:
-    """The mechanism, on the sphere at right angles to the mean. (N, D), (1, D) -> (N, D)"""
+def draw_near(u: Doubles, mean: Doubles | None, epsilon: float, rng: np.random.Generator) -> Doubles:
+    """Draw from the mechanism, on the sphere orthogonal to the mean. (N, D), (1, D) -> (N, D)"""
     rows, length = u.shape
     free = length - (mean is not None)  # n
-    covered = cap(epsilon, free)
-    q = covered / 2**PLACES
-    inside = draw_told(rows, epsilon, 2**PLACES, covered, rng)
-    share = np.where(inside, q * rng.random(rows), q + (1 - q) * rng.random(rows))  # of the sphere, nearer to u than v is
-    along = latitude(share, free)
+    covered = choose_cap(epsilon, free)
+    q = covered / 2**BINARY_DIGITS
+    inside = draw_inclusion(rows, epsilon, 2**BINARY_DIGITS, covered, rng)
+    fraction = np.where(inside, q * rng.random(rows), q + (1 - q) * rng.random(rows))  # of the sphere nearer to u than v
+    along = latitude(fraction, free)
     around = rng.normal(size=u.shape)
-    around = without(around - np.einsum("nd,nd->n", around, u)[:, None] * u, mean)  # at right angles to the mean, as u is
+    around = remove_mean(around - np.einsum("nd,nd->n", around, u)[:, None] * u, mean)  # orthogonal to the mean, as u is
     return along[:, None] * u + np.sqrt(1 - along**2)[:, None] * around
 
 
-def latitude(share: Doubles, length: int) -> Doubles:
-    """The cosine beyond which lies such a share of S^(n − 1): (1 + v·u) / 2 is Beta((n − 1)/2, (n − 1)/2). (N,) -> (N,)"""
+def latitude(fraction: Doubles, length: int) -> Doubles:
+    """The cosine with this fraction of S^(n − 1) beyond it: (1 + v·u) / 2 is Beta((n − 1)/2, (n − 1)/2). (N,) -> (N,)"""
     half = (length - 1) / 2
-    return 1 - 2 * betaincinv(half, half, share)
+    return 1 - 2 * betaincinv(half, half, fraction)
 
 
 @lru_cache(maxsize=64)
-def cap(epsilon: float, length: int) -> int:
-    """2^64 q for the cap at which the mean of v·u is greatest.
+def choose_cap(epsilon: float, length: int) -> int:
+    """Return 2^64 q for the cap with the greatest mean of v·u.
 
-    The part of v·u's mean that lies beyond γ is c = (1 − γ²)^((n − 1)/2) / ((n − 1) B(1/2, (n − 1)/2)) under the uniform
-    density, and that before it −c. So the mean is c (e^ε − 1) / (q e^ε + 1 − q).
+    The part of v·u's mean beyond γ is c = (1 − γ²)^((n − 1)/2) / ((n − 1) B(1/2, (n − 1)/2)) under the uniform
+    density, and the part before it −c. So the mean is c (e^ε − 1) / (q e^ε + 1 − q).
     """
     half = (length - 1) / 2
 
@@ -118,12 +118,12 @@ def cap(epsilon: float, length: int) -> int:
             return float(half * math.log1p(-(gamma**2)) - np.logaddexp(np.log(q) + epsilon, np.log1p(-q)))
 
     best = minimize_scalar(lambda gamma: -logarithm(gamma), bounds=(0.0, 1 - 1e-6), method="bounded", options={"xatol": 1e-9}).x
-    return min(2**PLACES - 1, max(1, round(float(betainc(half, half, (1 - best) / 2)) * 2**PLACES)))
+    return min(2**BINARY_DIGITS - 1, max(1, round(float(betainc(half, half, (1 - best) / 2)) * 2**BINARY_DIGITS)))
 
 
 def expected_cosine(epsilon: float, length: int) -> float:
     """The mean of v·u."""
-    q, half = cap(epsilon, length) / 2**PLACES, (length - 1) / 2
+    q, half = choose_cap(epsilon, length) / 2**BINARY_DIGITS, (length - 1) / 2
     gamma = float(latitude(np.array([q]), length)[0])
     beyond = half * math.log1p(-(gamma**2)) - math.log(2 * half) - betaln(0.5, half)
     return math.exp(beyond + math.log(math.expm1(epsilon)) - np.logaddexp(math.log(q) + epsilon, math.log1p(-q)))

@@ -1,8 +1,9 @@
-"""Records made into boards. What stands on one board may be compared, and nothing else.
+"""Comparison groups of records: experiments whose numbers can be compared.
 
-All of a board has one schema, task with its settings, dataset (by its content, so that another split is another dataset),
-extractor, metric settings and source of this program. Where there are several seeds, each has a board, and the cells that have
-them all share one more, where each unit counts with its mean over the seeds. Runs of one cell in several environments stay apart.
+The experiments of a group share schema, task with its settings, dataset, extractor, metric settings and source code. A dataset is
+identified by its content, so that another split is another dataset. Each seed has its own group. The experiments that have all
+seeds share one more group, where each sample counts with its mean over the seeds. Runs of one experiment in several environments
+stay separate.
 """
 
 from __future__ import annotations
@@ -15,201 +16,211 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from bench.core.errors import UserError
-from bench.core.hashing import canonical, short_hash
+from bench.core.hashing import canonical_json, short_hash
 from bench.runner import records as files
 from bench.runner.records import FILE, Record
 from leaderboard.intervals import Interval
-from leaderboard.measures import PRIVACY, Measure, measures, summary
-from leaderboard.tables import FIRST, extractor_label, labels, setting, units_of
+from leaderboard.measures import PRIVACY, Measure, list_measures, summarize
+from leaderboard.tables import FIRST_METRICS, build_labels, format_setting, label_extractor, name_samples
 
 T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class Found:
-    """A record, and the folder that it lies in beside the pictures."""
+class LocatedRecord:
+    """A record, and the folder that holds it and its images."""
 
     record: Record
     folder: Path
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Cell:
-    """One defense against one attack, or alone where the task takes no attack, with the records of all its units and seeds."""
+class GroupedExperiment:
+    """One defense against one attack, or alone where the task takes no attack, with the records of all samples and seeds."""
 
     defense: str  # labels
     attack: str
-    found: tuple[Found, ...]
+    records: tuple[LocatedRecord, ...]
 
     @property
-    def head(self) -> Record:
-        """The first record, for what all of them share."""
-        return self.found[0].record
+    def metadata(self) -> Record:
+        """The first record, for the fields that all of them share."""
+        return self.records[0].record
 
     @property
     def key(self) -> str:
-        """Tells cells apart, on all boards together."""
-        return short_hash(sorted({one.record["run_hash"] for one in self.found}))
+        """Identifies the experiment among those of all groups."""
+        return short_hash(sorted({located.record["run_hash"] for located in self.records}))
 
     @property
     def reason(self) -> str | None:
-        """Why it does not apply, if it does not."""
-        return self.head["reason"] if self.head["status"] == "n/a" else None
+        """Why the experiment does not apply, or None."""
+        return self.metadata["reason"] if self.metadata["status"] == "n/a" else None
 
     @functools.cached_property
-    def done(self) -> list[Record]:
-        return [one.record for one in self.found if one.record["status"] == "ok"]
+    def completed(self) -> list[Record]:
+        return [located.record for located in self.records if located.record["status"] == "ok"]
+
+    @property
+    def failed(self) -> list[Record]:
+        return [located.record for located in self.records if located.record["status"] == "failed"]
 
     @functools.cached_property
-    def by_unit(self) -> list[list[Record]]:
-        """What is done, together for each unit."""
-        units: dict[str, list[Record]] = {}
-        for record in self.done:
-            units.setdefault(record["unit"], []).append(record)
-        return list(units.values())
+    def by_sample(self) -> list[list[Record]]:
+        """The completed records, one list per sample."""
+        samples: dict[str, list[Record]] = {}
+        for record in self.completed:
+            samples.setdefault(record["sample"], []).append(record)
+        return list(samples.values())
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Board:
-    """Cells that may be compared."""
+class ComparisonGroup:
+    """Experiments that can be compared."""
 
-    cells: tuple[Cell, ...]
+    experiments: tuple[GroupedExperiment, ...]
     seeds: tuple[int, ...]
-    units: tuple[str, ...]  # what at least one cell has done, in the order of the records
-    conditions: tuple[str | None, ...]  # such as day and night; (None,) where units have none
+    samples: tuple[str, ...]  # those that some experiment has completed, in the order of the records
+    conditions: tuple[str | None, ...]  # such as day and night; (None,) where samples have none
     measures: tuple[Measure, ...]  # those that some record has a value of
 
     @property
-    def head(self) -> Record:
-        return self.cells[0].head
+    def metadata(self) -> Record:
+        return self.experiments[0].metadata
 
     @property
     def key(self) -> str:
-        """Tells boards apart."""
-        return short_hash([_comparable(self.head), self.seeds])
+        """Identifies the group."""
+        return short_hash([_comparison_key(self.metadata), self.seeds])
 
     @property
     def title(self) -> str:
-        return f"{self.head['task'].capitalize()} on {self.head['dataset']['name']}"
+        return f"{self.metadata['task'].capitalize()} on {self.metadata['dataset']['name']}"
 
     @property
     def settings(self) -> str:
-        """Those of its task."""
-        told = {name: value for name, value in (self.head.get("task_settings") or {}).items() if value is not None}
-        return ", ".join(f"{name} {setting(value)}" for name, value in told.items())
+        """The settings of the task."""
+        given = {name: value for name, value in (self.metadata.get("task_settings") or {}).items() if value is not None}
+        return ", ".join(f"{name} {format_setting(value)}" for name, value in given.items())
 
     @property
     def facts(self) -> list[str]:
-        """What all its numbers share."""
+        """What all numbers of the group share."""
         seeds = ", ".join(map(str, self.seeds))
         return [
-            f"{len(self.units)} {units_of(self.head['task'], len(self.units))}",
-            f"{extractor_label(self.head['dataset']['extractor'])} features",
+            f"{len(self.samples)} {name_samples(self.metadata['task'], len(self.samples))}",
+            f"{label_extractor(self.metadata['dataset']['extractor'])} features",
             *([self.settings] if self.settings else []),
             f"seed {seeds}" if len(self.seeds) == 1 else f"mean over seeds {seeds}",
-            f"source {_digits(self.head['environment']['source'])}",
-            f"content {_digits(self.head['dataset']['hash'])}",
+            f"source {_shorten_digest(self.metadata['environment']['source'])}",
+            f"content {_shorten_digest(self.metadata['dataset']['hash'])}",
         ]
 
     @property
-    def attacked(self) -> bool:
-        """Whether it judges what attacks make of a release, and not the release itself."""
-        return any(cell.head["attack"] is not None for cell in self.cells)
+    def has_attacks(self) -> bool:
+        """Whether the group judges attacks on releases, and not the releases themselves."""
+        return any(experiment.metadata["attack"] is not None for experiment in self.experiments)
 
-    def whole(self, cell: Cell) -> list[list[Record]]:
-        """The records of each unit that the cell has done with every seed."""
-        return [group for group in cell.by_unit if len(group) == len(self.seeds)]
+    def complete_samples(self, experiment: GroupedExperiment) -> list[list[Record]]:
+        """Return the records of each sample that the experiment has completed with every seed."""
+        return [records for records in experiment.by_sample if len(records) == len(self.seeds)]
 
-    def values(self, cell: Cell, metric: str, condition: str | None = None) -> list[float | None]:
-        """The value of each such unit, averaged over the seeds; of those of one condition if it is given."""
-        chosen = [group for group in self.whole(cell) if condition is None or group[0].get("condition") == condition]
-        return [_mean([record["metrics"].get(metric) for record in group]) for group in chosen]
+    def list_values(self, experiment: GroupedExperiment, metric: str, condition: str | None = None) -> list[float | None]:
+        """Return the value of each such sample, averaged over the seeds; for one condition if it is given."""
+        samples = self.complete_samples(experiment)
+        selection = [records for records in samples if condition is None or records[0].get("condition") == condition]
+        return [_mean([record["metrics"].get(metric) for record in records]) for records in selection]
 
-    def average(self, cell: Cell, of: Measure, condition: str | None = None) -> Interval | None:
-        """Its mean over the units, or what stands for it; None where there is nothing to average."""
-        return summary(of, self.values(cell, of.name, condition))
+    def average(self, experiment: GroupedExperiment, measure: Measure, condition: str | None = None) -> Interval | None:
+        """Return the measure's average over the samples; None where there is nothing to average."""
+        return summarize(measure, self.list_values(experiment, measure.name, condition))
 
-    def missing(self, cell: Cell) -> int:
-        """How many of the board's units the cell has not done; none where it does not apply."""
-        return 0 if cell.reason else len(self.units) - len(self.whole(cell))
+    def count_missing(self, experiment: GroupedExperiment) -> int:
+        """Return how many samples of the group the experiment lacks; 0 where it does not apply."""
+        return 0 if experiment.reason else len(self.samples) - len(self.complete_samples(experiment))
 
 
-def find(results: Path) -> list[Found]:
-    """The latest records of all files below a folder, or of one file.
+def load_records(*results: Path) -> list[LocatedRecord]:
+    """Return the latest records of files, and of all files below folders.
 
     Raises
     ------
     UserError
-        if there is none, or a file is damaged; the message names the file and the line.
+        if one of `results` has no record, or a file is damaged; the message names the file and the line.
     """
-    paths = sorted(results.rglob(FILE)) if results.is_dir() else [files.find(results)]
-    latest: dict[tuple[str, str], Found] = {}
-    for path in paths:
-        contents = files.read(path)
-        if contents.notice:
-            logging.getLogger(__name__).warning(contents.notice)
-        latest |= {(record["run_hash"], record["unit"]): Found(record, path.parent) for record in contents.records}
-    if not latest:
-        raise UserError(f"--results {results}: there is no record in it (looked for files called {FILE})")
+    latest: dict[tuple[str, str], LocatedRecord] = {}
+    for result in results:
+        contents = [(path.parent, files.read(path)) for path in _list_files(result)]
+        if not any(content.records for _, content in contents):
+            raise UserError(f"--results {result}: there is no record in it (looked for files called {FILE})")
+        for folder, content in contents:
+            if content.notice:
+                logging.getLogger(__name__).warning(content.notice)
+            latest |= {(record["run_hash"], record["sample"]): LocatedRecord(record, folder) for record in content.records}
     return list(latest.values())
 
 
-def boards(found: Sequence[Found]) -> list[Board]:
-    """All boards, those of attacks first; of one kind the latest records first."""
-    made = []
-    for group in reversed(_grouped(found, lambda one: _comparable(one.record))):
-        seeds = tuple(sorted({one.record["seed"] for one in group}))
-        together = _cells(group)
+def _list_files(result: Path) -> list[Path]:
+    return sorted(result.rglob(FILE)) if result.is_dir() else [files.find_file(result)]
+
+
+def build_groups(records: Sequence[LocatedRecord]) -> list[ComparisonGroup]:
+    """Return all groups, those with attacks first, and among the others the latest records first."""
+    groups = []
+    for comparable in reversed(_group_by(records, lambda located: _comparison_key(located.record))):
+        seeds = tuple(sorted({located.record["seed"] for located in comparable}))
+        experiments = _group_experiments(comparable)
         if len(seeds) > 1:
-            shared = [cell for cell in together if {one.record["seed"] for one in cell} == set(seeds)]
-            made += [_board(shared, seeds)] if shared else []
+            shared = [part for part in experiments if {located.record["seed"] for located in part} == set(seeds)]
+            groups += [_build_group(shared, seeds)] if shared else []
         for seed in seeds:
-            made.append(
-                _board([part for cell in together if (part := [one for one in cell if one.record["seed"] == seed])], (seed,))
-            )
-    return sorted(made, key=lambda board: (not board.attacked, board.head["task"], board.head["dataset"]["name"]))
+            parts = ([located for located in part if located.record["seed"] == seed] for part in experiments)
+            groups.append(_build_group([part for part in parts if part], (seed,)))
+    return sorted(groups, key=lambda group: (not group.has_attacks, group.metadata["task"], group.metadata["dataset"]["name"]))
 
 
-def _comparable(record: Record) -> list[Any]:
+def _comparison_key(record: Record) -> list[Any]:
     dataset = [record["dataset"][key] for key in ("hash", "extractor")]
-    task = [record["task"], record.get("task_settings")]  # older records don't tell them
+    task = [record["task"], record.get("task_settings")]  # older records lack them
     return [record["schema"], task, dataset, record["metric_settings"], record["environment"]["source"]]
 
 
-def _cells(found: Sequence[Found]) -> list[list[Found]]:
-    """Parted by defense, attack and environment."""
-    return _grouped(found, lambda one: [one.record[name] for name in ("defense", "attack", "environment")])
+def _group_experiments(records: Sequence[LocatedRecord]) -> list[list[LocatedRecord]]:
+    """Group the records by defense, attack and environment."""
+    return _group_by(records, lambda located: [located.record[name] for name in ("defense", "attack", "environment")])
 
 
-def _board(cells: Sequence[Sequence[Found]], seeds: tuple[int, ...]) -> Board:
-    heads = [cell[0].record for cell in cells]
-    names = labels([(head["defense"], head["attack"]) for head in heads])
-    made = tuple(
-        Cell(defense=defense, attack=attack + apart, found=tuple(cell))
-        for cell, (defense, attack), apart in zip(cells, names, _apart(heads), strict=True)
+def _build_group(parts: Sequence[Sequence[LocatedRecord]], seeds: tuple[int, ...]) -> ComparisonGroup:
+    """Return the group of the experiments that have these records."""
+    first = [part[0].record for part in parts]
+    labels = build_labels([(record["defense"], record["attack"]) for record in first])
+    experiments = tuple(
+        GroupedExperiment(defense=defense, attack=attack + environment, records=tuple(part))
+        for part, (defense, attack), environment in zip(parts, labels, _label_environments(first), strict=True)
     )
-    done = [record for cell in made for record in cell.done]
-    named = {name for record in done for name, value in record["metrics"].items() if value is not None}
-    conditions = tuple(sorted({str(told) for record in done if (told := record.get("condition")) is not None})) or (None,)
-    return Board(
-        cells=made,
+    completed = [record for experiment in experiments for record in experiment.completed]
+    metrics = {name for record in completed for name, value in record["metrics"].items() if value is not None}
+    conditions = {str(condition) for record in completed if (condition := record.get("condition")) is not None}
+    measures = list_measures(_order_metrics(metrics))
+    return ComparisonGroup(
+        experiments=experiments,
         seeds=seeds,
-        units=tuple(dict.fromkeys(record["unit"] for record in done)),
-        conditions=conditions,
-        measures=tuple(sorted(measures(_by_name(named)), key=lambda measure: (measure.name != PRIVACY, measure.kind != "share"))),
+        samples=tuple(dict.fromkeys(record["sample"] for record in completed)),
+        conditions=tuple(sorted(conditions)) or (None,),
+        measures=tuple(sorted(measures, key=lambda measure: (measure.name != PRIVACY, measure.kind != "fraction"))),
     )
 
 
-def _by_name(metrics: set[str]) -> list[str]:
-    """The paper's first, in its order."""
-    return [*(name for name in FIRST if name in metrics), *sorted(metrics - set(FIRST))]
+def _order_metrics(metrics: set[str]) -> list[str]:
+    """Return the paper's metrics in its order, then the others by name."""
+    return [*(name for name in FIRST_METRICS if name in metrics), *sorted(metrics - set(FIRST_METRICS))]
 
 
-def _apart(heads: Sequence[Record]) -> list[str]:
-    """What is to be added to a label so that runs of one cell in several environments can be told from each other."""
-    pairs = [canonical([head["defense"], head["attack"]]) for head in heads]
-    environments = [head["environment"] for head in heads]
-    differing = sorted(name for name in environments[0] if len({canonical(one.get(name)) for one in environments}) > 1)
+def _label_environments(first: Sequence[Record]) -> list[str]:
+    """Return what distinguishes the label of an experiment that was run in several environments; "" for the others."""
+    pairs = [canonical_json([record["defense"], record["attack"]]) for record in first]
+    environments = [record["environment"] for record in first]
+    differing = sorted(name for name in environments[0] if len({canonical_json(one.get(name)) for one in environments}) > 1)
     return [
         f" ({', '.join(f'{name} {environment.get(name)}' for name in differing)})" if pairs.count(pair) > 1 else ""
         for environment, pair in zip(environments, pairs, strict=True)
@@ -221,13 +232,12 @@ def _mean(values: Sequence[Any]) -> float | None:
     return sum(known) / len(known) if known else None
 
 
-def _grouped(items: Iterable[T], key: Callable[[T], Any]) -> list[list[T]]:
+def _group_by(items: Iterable[T], key: Callable[[T], Any]) -> list[list[T]]:
     groups: dict[str, list[T]] = {}
     for item in items:
-        groups.setdefault(canonical(key(item)), []).append(item)
+        groups.setdefault(canonical_json(key(item)), []).append(item)
     return list(groups.values())
 
 
-def _digits(digest: str) -> str:
-    """Enough of a digest to tell it."""
+def _shorten_digest(digest: str) -> str:
     return digest.removeprefix("sha256:")[:8]

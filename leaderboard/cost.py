@@ -15,18 +15,18 @@ import numpy as np
 from bench.api import Extractor, ImageAttack, View
 from bench.codebook.public import Public
 from bench.geometry.nearest_words import WordIndex
-from bench.geometry.subspaces import nearest_to_subspaces
+from bench.geometry.subspaces import find_nearest_to_subspaces
 from bench.images import photographs
-from bench.mechanisms.subset import word_subsets
+from bench.mechanisms.subset import draw_word_subsets
 from bench.registry import discovery, spec
-from bench.tasks.reconstruction import offered
+from bench.tasks.reconstruction import offer_knowledge
 from bench.types import Features, Subspaces
 
 DAY = 86_400  # seconds
 POSITION = 8  # bytes of two float32
 WORD = 4  # bytes of a word's number
 FLOAT = 4
-LEAST = 0.2  # seconds that a rate is measured for, at least
+MIN_SECONDS = 0.2  # seconds that a rate is measured for, at least
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +51,7 @@ class Rates:
     sets: float  # sets drawn a second
     extraction: float  # seconds a photograph of 256 x 256
     lifting: float  # seconds a keypoint
-    painting: float  # seconds a photograph of 256 x 256
+    reconstruction: float  # seconds a photograph of 256 x 256
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,7 +65,7 @@ class Cost:
     seconds: float | None = None
 
 
-def measure(service: Service) -> Rates:
+def measure_rates(service: Service) -> Rates:
     """Measure the rates on a photograph that scikit-image carries, with one thread. Takes seconds to a minute.
 
     Raises
@@ -78,15 +78,15 @@ def measure(service: Service) -> Rates:
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        return _measured(service)
+        return _measure(service)
     finally:
         torch.set_num_threads(threads)
 
 
-def _measured(service: Service) -> Rates:
+def _measure(service: Service) -> Rates:
     public = Public()
     rng = np.random.default_rng(0)
-    pixels = photographs.read(photographs.builtin()[0].path).pixels
+    pixels = photographs.read(photographs.list_builtin()[0].path).pixels
     extractor = spec.read("sift", discovery.EXTRACTOR)
     secret = extractor.extract(pixels)
     few = secret.take(np.arange(min(len(secret), 128)))
@@ -100,35 +100,35 @@ def _measured(service: Service) -> Rates:
     true = rng.integers(len(known), size=10_000)
     size = 2.0 * len(few) * service.length
     return Rates(
-        search=size * len(known) / _seconds(lambda: index.nearest(codes)),
-        subspaces=size * (service.dim + 1) * len(database) / _seconds(lambda: nearest_to_subspaces(release, database.words, 8)),
-        sets=len(true) / _seconds(lambda: word_subsets(true, len(known), 10.0, service.subset_size, rng)),
-        extraction=_seconds(lambda: extractor.extract(pixels)),
-        lifting=_seconds(lambda: lifting.protect(few, public, rng)) / len(few),
-        painting=_painting(secret, extractor, public),
+        search=size * len(known) / _time(lambda: index.find_nearest(codes)),
+        subspaces=size * (service.dim + 1) * len(database) / _time(lambda: find_nearest_to_subspaces(release, database.words, 8)),
+        sets=len(true) / _time(lambda: draw_word_subsets(true, len(known), 10.0, service.subset_size, rng)),
+        extraction=_time(lambda: extractor.extract(pixels)),
+        lifting=_time(lambda: lifting.protect(few, public, rng)) / len(few),
+        reconstruction=_time_reconstruction(secret, extractor, public),
     )
 
 
-def _painting(secret: Features, extractor: Extractor, public: Public) -> float:
+def _time_reconstruction(secret: Features, extractor: Extractor, public: Public) -> float:
     attack, defense = spec.read("dia", discovery.ATTACK), spec.read("none", discovery.DEFENSE)
     assert isinstance(attack, ImageAttack)
     release = defense.protect(secret, public, np.random.default_rng(0))
-    view = View(release=release, defense=defense, extractor=extractor, knowledge=offered(attack, defense, public))
-    return _seconds(lambda: attack.reconstruct(view, np.random.default_rng(0)))
+    view = View(release=release, defense=defense, extractor=extractor, knowledge=offer_knowledge(attack, defense, public))
+    return _time(lambda: attack.reconstruct(view, np.random.default_rng(0)))
 
 
-def _seconds(work: Callable[[], object]) -> float:
+def _time(work: Callable[[], object]) -> float:
     """Of the processor, the shortest of several runs; the first, which may fill caches, does not count."""
     work()
     taken: list[float] = []
-    while sum(taken) < LEAST or len(taken) < 3:
+    while sum(taken) < MIN_SECONDS or len(taken) < 3:
         started = time.process_time()
         work()
         taken.append(time.process_time() - started)
     return max(min(taken), 1e-9)
 
 
-def query(service: Service, rates: Rates) -> Iterator[Cost]:
+def list_costs(service: Service, rates: Rates) -> Iterator[Cost]:
     """The steps of one query, on the phone, on the way, on the server, and of an attacker."""
     n, d, m, dim = service.keypoints, service.length, service.subset_size, service.dim
     search = 2.0 * n * service.words * d
@@ -147,7 +147,7 @@ def query(service: Service, rates: Rates) -> Iterator[Cost]:
         who="server", step="match, affine", operations=(dim + 1) * matching, seconds=(dim + 1) * matching / rates.subspaces
     )
     yield Cost(who="attacker", step="affine: words near subspaces", operations=attack, seconds=attack / rates.subspaces)
-    yield Cost(who="attacker", step="paint, 256 x 256, eight times", seconds=rates.painting)
+    yield Cost(who="attacker", step="paint, 256 x 256, eight times", seconds=rates.reconstruction)
 
 
 def rows(service: Service, rates: Rates, queries: int) -> list[tuple[str, ...]]:
@@ -162,5 +162,5 @@ def rows(service: Service, rates: Rates, queries: int) -> list[tuple[str, ...]]:
             "" if cost.sent is None else f"{cost.sent * queries / 1e12:.3g}",
             "" if cost.seconds is None else f"{cost.seconds * queries / DAY:.2g}",
         )
-        for cost in query(service, rates)
+        for cost in list_costs(service, rates)
     ]

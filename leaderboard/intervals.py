@@ -40,7 +40,7 @@ def interval(values: ArrayLike, level: float = LEVEL) -> Interval:
     return Interval(float(sample.mean()), float(low), float(high), len(sample))
 
 
-def independent(samples: Sequence[ArrayLike], weights: Sequence[float]) -> Interval:
+def combine_independent(samples: Sequence[ArrayLike], weights: Sequence[float]) -> Interval:
     """Σ weight · mean of samples that have nothing to do with each other, each resampled by itself; `count` is the smallest's."""
     total, resampled = 0.0, np.zeros(RESAMPLES)
     for rng, values, weight in zip(np.random.default_rng(SEED).spawn(len(samples)), samples, weights, strict=True):

@@ -1,4 +1,4 @@
-"""What the numbers of records are: their names for people, which way is better for whoever defends, and how they are averaged."""
+"""Measures: the labels of the numbers in records, which direction is better for the defender, and how they are averaged."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ import numpy as np
 
 from bench.registry import discovery
 from leaderboard.intervals import Interval, interval, proportion
-from leaderboard.tables import MEDIANS, PAPER
+from leaderboard.tables import MEDIAN_METRICS, PAPER_METRICS
 
-PRIVACY = "ssim"  # what attacks are compared by: how much of the photograph comes back
-# What a server can do, the first of these that was measured: its recall of localization, or else how well it matches.
+PRIVACY = "ssim"  # ranks attacks by how much of the photograph they reconstruct
+# The first of these that was measured is the utility: the recall of localization, or else the accuracy of matching.
 UTILITY = ("recall_0.25m_2deg", "accuracy_3px")
 
-PARTS = ("foreground", "background")  # of an image, over which some metrics are told as well
+PARTS = ("foreground", "background")  # of an image, for which some metrics are also recorded
 
 
 @dataclass(frozen=True)
@@ -30,46 +30,46 @@ class Measure:
 
     name: str
     label: str
-    better: int  # 1: the defender likes more of it, -1: less, 0: neither
-    # Shares are of units that did or did not succeed. Medians count a unit without a value as the worst.
-    kind: Literal["mean", "share", "median"] = "mean"
+    better: int  # for the defender: 1 if larger is better, -1 if smaller, 0 if neither
+    # A fraction counts the samples that succeed. A median counts a sample without a value as the worst.
+    kind: Literal["mean", "fraction", "median"] = "mean"
     explanation: str = ""
 
 
-def measures(names: Iterable[str]) -> list[Measure]:
-    """What is known of these metrics; of one that is not installed here, nothing but its name."""
-    known = {measure.name: measure for measure in (*_OF_TASKS, *_of_plugins())}
+def list_measures(names: Iterable[str]) -> list[Measure]:
+    """Return the measures of these metrics. One that is not installed has a name alone."""
+    known = {measure.name: measure for measure in (*_TASK_MEASURES, *_list_plugin_measures())}
     for measure, part in itertools.product(list(known.values()), PARTS):
         name = f"{measure.name}_{part}"
         known[name] = dataclasses.replace(measure, name=name, label=f"{measure.label}, {part}", explanation="")
-    return [known.get(name) or _family(name) for name in names]
+    return [known.get(name) or _parse_measure(name) for name in names]
 
 
-def summary(of: Measure, values: Sequence[float | None]) -> Interval | None:
-    """Averages the values of one measure, one a unit and None where there is none; None if there is nothing to average.
+def summarize(measure: Measure, values: Sequence[float | None]) -> Interval | None:
+    """Return the average of a measure from one value per sample, None where a sample has none; None if no sample has one.
 
     A median has no interval: its ends are infinite.
     """
-    return _summary(of, tuple(values))
+    return _summarize(measure, tuple(values))
 
 
-@functools.lru_cache(maxsize=1 << 14)  # tables, ranks and plots ask for the same ones
-def _summary(of: Measure, values: tuple[float | None, ...]) -> Interval | None:
+@functools.lru_cache(maxsize=1 << 14)  # tables, ranks and plots need the same ones
+def _summarize(measure: Measure, values: tuple[float | None, ...]) -> Interval | None:
     known = [value for value in values if value is not None]
     if not known:
         return None
-    if of.kind == "median":
+    if measure.kind == "median":
         middle = float(np.median([math.inf if value is None else value for value in values]))
         return Interval(middle, -math.inf, math.inf, len(values))
-    if of.kind == "share" and set(known) <= {0.0, 1.0}:
+    if measure.kind == "fraction" and set(known) <= {0.0, 1.0}:
         return proportion(known)
-    return interval(known)  # of a share, too, once each unit has its mean over several seeds
+    return interval(known)  # also for a fraction, once each sample has its mean over several seeds
 
 
-_OF_TASKS = (
+_TASK_MEASURES = (
     *(
         Measure(name, name.replace("_", " "), -1, "median", f"median over queries, in {unit}; ∞ if not localized")
-        for name, unit in zip(MEDIANS, ("scene units", "degrees"), strict=True)
+        for name, unit in zip(MEDIAN_METRICS, ("scene units", "degrees"), strict=True)
     ),
     Measure("precision", "precision", 1, "mean", "share of matches that are right"),
     Measure("recall", "recall", 1, "mean", "share of right matches that are found"),
@@ -81,19 +81,19 @@ _OF_TASKS = (
 )
 
 
-def _of_plugins() -> Iterator[Measure]:
-    for plugin in discovery.everything(discovery.METRIC):
+def _list_plugin_measures() -> Iterator[Measure]:
+    for plugin in discovery.load_plugins(discovery.METRIC):
         name = plugin.name()
         better = -1 if plugin.higher_is_better_for == "attacker" else 1
-        yield Measure(name, name.upper() if name in PAPER else name, better, "mean", plugin.description())
+        yield Measure(name, name.upper() if name in PAPER_METRICS else name, better, "mean", plugin.description())
 
 
-def _family(name: str) -> Measure:
-    """A metric whose name tells a threshold."""
-    if found := re.fullmatch(r"recall_([\d.]+)m_([\d.]+)deg", name):
-        metres, degrees = found.groups()
-        told = f"share of queries localized within {metres} m and {degrees}°, with Wilson's interval"
-        return Measure(name, f"recall ({metres} m, {degrees}°)", 1, "share", told)
-    if found := re.fullmatch(r"accuracy_([\d.]+)px", name):
-        return Measure(name, f"accuracy ({found[1]} px)", 1, "mean", f"matching accuracy at {found[1]} pixels")
+def _parse_measure(name: str) -> Measure:
+    """Return the measure of a metric whose name states a threshold."""
+    if match := re.fullmatch(r"recall_([\d.]+)m_([\d.]+)deg", name):
+        metres, degrees = match.groups()
+        explanation = f"share of queries localized within {metres} m and {degrees}°, with Wilson's interval"
+        return Measure(name, f"recall ({metres} m, {degrees}°)", 1, "fraction", explanation)
+    if match := re.fullmatch(r"accuracy_([\d.]+)px", name):
+        return Measure(name, f"accuracy ({match[1]} px)", 1, "mean", f"matching accuracy at {match[1]} pixels")
     return Measure(name, name, 0)

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from bench.mechanisms.multi_release import bound_on_success, chances_of_success
+from bench.mechanisms.multi_release import bound_success, compute_success_chances
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def rows(epsilon: float, domain: int, size: int, releases: int) -> list[dict[str, Any]]:
+def build_rows(epsilon: float, domain: int, size: int, releases: int) -> list[dict[str, Any]]:
     """One row for each T = 1, ..., `releases`, of the ω-subset mechanism on |K| = `domain` words with m = `size`.
 
     `success` is the chance that the word that most sets hold is the true one, `bound` the greatest that any guess can have at
     T ε, and `epsilon_total` is T ε.
     """
-    chances = chances_of_success(epsilon, domain, size, releases)
+    chances = compute_success_chances(epsilon, domain, size, releases)
     return [
         {
             "releases": number,
@@ -25,7 +25,7 @@ def rows(epsilon: float, domain: int, size: int, releases: int) -> list[dict[str
             "words": domain,
             "subset_size": size,
             "success": chance,
-            "bound": bound_on_success(number * epsilon, domain),
+            "bound": bound_success(number * epsilon, domain),
         }
         for number, chance in enumerate(chances, start=1)
     ]

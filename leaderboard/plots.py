@@ -1,4 +1,4 @@
-"""Plots of boards, for print, for grey, and for people who tell few colours: marks and line styles differ, not colour alone."""
+"""Plots of a comparison group. Points and line styles differ, not colour alone: for print in grey and for colour blindness."""
 
 from __future__ import annotations
 
@@ -6,149 +6,152 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
-from bench.core.hashing import canonical
-from leaderboard.comparison import Board
-from leaderboard.figures import drawable
+from bench.core.hashing import canonical_json
+from leaderboard.comparison import ComparisonGroup
+from leaderboard.figures import escape_text
 from leaderboard.intervals import Interval
-from leaderboard.measures import PRIVACY, measures
-from leaderboard.plot_style import Mark, marks, place_labels
-from leaderboard.ranking import Standing, standings
-from leaderboard.tables import labels, setting
+from leaderboard.measures import PRIVACY, list_measures
+from leaderboard.plot_style import PlotStyle, choose_styles, place_labels
+from leaderboard.ranking import Standing, rank_defenses
+from leaderboard.tables import build_labels, format_setting
 from leaderboard.tradeoff import Tradeoff
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-TRADEOFF = "tradeoff"  # begins the names of the plots that the page draws itself
+TRADEOFF = "tradeoff"  # prefix of the plots that the page draws itself
 BRIEF = 48  # letters of a label
 ROW = 0.3  # inches a defense
 LETTER = 3.9, 9.0  # points that a letter of a label is wide and high
 
 
-def plots(board: Board, found: Sequence[Tradeoff]) -> Iterator[tuple[str, Figure]]:
-    """Name and figure of each plot of a board of attacks."""
-    ranked = standings(board)
-    if any(one.score for one in ranked):
-        yield "attacks", attacks(board, ranked)
-    if curves := _curves(ranked):
-        yield "epsilon", epsilon(board, curves)
-    several = len({one.served.key for one in found}) > 1
-    for one in found:
-        yield "-".join(filter(None, (TRADEOFF, one.condition, one.served.key[:8] if several else None))), tradeoff(one)
+def draw_plots(group: ComparisonGroup, tradeoffs: Sequence[Tradeoff]) -> Iterator[tuple[str, Figure]]:
+    """Yield the name and the figure of each plot of a group with attacks."""
+    ranked = rank_defenses(group)
+    if any(standing.score for standing in ranked):
+        yield "attacks", draw_attacks(group, ranked)
+    if curves := _collect_curves(ranked):
+        yield "epsilon", draw_epsilon(group, curves)
+    several = len({tradeoff.utility_group.key for tradeoff in tradeoffs}) > 1
+    for tradeoff in tradeoffs:
+        key = tradeoff.utility_group.key[:8] if several else None
+        yield "-".join(filter(None, (TRADEOFF, tradeoff.condition, key))), draw_tradeoff(tradeoff)
 
 
-def tradeoff(found: Tradeoff) -> Figure:
-    """Every defense and setting: its utility to the right, what the strongest attack sees upwards; with the Pareto front."""
-    figure, axes = _axes(7.2, 4.6, found.caption)
-    for family, mark in family_marks(found).items():
-        of_it = [point for point in found.points if point.standing.configuration["name"] == family]
+def draw_tradeoff(tradeoff: Tradeoff) -> Figure:
+    """Draw each defense and setting, with utility to the right, what the strongest attack recovers upwards, and the Pareto front."""
+    figure, axes = _create_axes(7.2, 4.6, tradeoff.caption)
+    for family, style in choose_family_styles(tradeoff).items():
+        members = [point for point in tradeoff.points if point.standing.configuration["name"] == family]
         for ranked, label in ((True, family), (False, f"{family}, unranked")):
-            at = [(point.utility, point.privacy) for point in of_it if (point.standing.rank is not None) == ranked]
-            _scatter(axes, at, mark, filled=ranked, label=label)
+            at = [(point.utility, point.privacy) for point in members if (point.standing.rank is not None) == ranked]
+            _draw_points(axes, at, style, filled=ranked, label=label)
     # Between two settings of the front, what the further one costs is the least that buys more than the nearer one gives.
-    x, y = [point.utility.mean for point in found.front], [point.privacy.mean for point in found.front]
+    x, y = [point.utility.mean for point in tradeoff.front], [point.privacy.mean for point in tradeoff.front]
     axes.plot(x, y, color="0.35", lw=1, ls=(0, (4, 2)), drawstyle="steps-pre", zorder=1, label="Pareto front")
-    axes.set_xlabel(f"{found.utility.label} →", fontsize=9)
-    axes.set_ylabel(f"{found.privacy.label} of the strongest attack →", fontsize=9)
+    axes.set_xlabel(f"{tradeoff.utility.label} →", fontsize=9)
+    axes.set_ylabel(f"{tradeoff.privacy.label} of the strongest attack →", fontsize=9)
     axes.margins(0.12)
     axes.legend(fontsize=7, frameon=False, loc="upper left", bbox_to_anchor=(1, 1))
-    figure.draw_without_rendering()  # so that it is known where the points lie
-    _write_settings(axes, found)
+    figure.draw_without_rendering()  # fixes the positions of the points
+    _write_settings(axes, tradeoff)
     return figure
 
 
-def attacks(board: Board, ranked: Sequence[Standing]) -> Figure:
-    """What every attack brings back of every defense, a line a defense, with intervals."""
-    (privacy,) = measures([PRIVACY])
-    names = list(dict.fromkeys(cell.attack for one in ranked for cell in one.cells if board.average(cell, privacy)))
+def draw_attacks(group: ComparisonGroup, ranked: Sequence[Standing]) -> Figure:
+    """Draw what each attack recovers of each defense, one line per defense, with intervals."""
+    (privacy,) = list_measures([PRIVACY])
+    experiments = [experiment for standing in ranked for experiment in standing.experiments]
+    names = list(dict.fromkeys(experiment.attack for experiment in experiments if group.average(experiment, privacy)))
     height = ROW * len(ranked) * max(1.0, len(names) / 3)
-    figure, axes = _axes(
-        9.0, 1.2 + height, f"{', '.join([board.title, *board.facts[:3]])}. Filled: the strongest attack on that defense"
+    figure, axes = _create_axes(
+        9.0, 1.2 + height, f"{', '.join([group.title, *group.facts[:3]])}. Filled: the strongest attack on that defense"
     )
-    for place, (name, mark) in enumerate(marks(names).items()):
-        beside = (place - (len(names) - 1) / 2) / (len(names) + 1)
+    for index, (name, style) in enumerate(choose_styles(names).items()):
+        offset = (index - (len(names) - 1) / 2) / (len(names) + 1)
         for filled in (True, False):
             at = [
-                (score, Interval(row + beside, -math.inf, math.inf, 1))
-                for row, one in enumerate(ranked)
-                for cell in one.cells
-                if cell.attack == name and (cell is one.strongest) == filled and (score := board.average(cell, privacy))
+                (score, Interval(row + offset, -math.inf, math.inf, 1))
+                for row, standing in enumerate(ranked)
+                for experiment in standing.experiments
+                if experiment.attack == name and (experiment is standing.strongest) == filled
+                if (score := group.average(experiment, privacy))
             ]
-            _scatter(axes, at, mark, filled=filled, label=None)
-        axes.plot([], [], mark.marker, color=mark.colour, mfc="white", label=_brief(name))
-    axes.set_yticks(range(len(ranked)), [_ranked(one) for one in ranked], fontsize=8)
+            _draw_points(axes, at, style, filled=filled, label=None)
+        axes.plot([], [], style.marker, color=style.colour, mfc="white", label=_shorten(name))
+    axes.set_yticks(range(len(ranked)), [_label_standing(standing) for standing in ranked], fontsize=8)
     axes.set_ylim(len(ranked) - 0.5, -0.5)
     axes.set_xlabel(f"{privacy.label} →", fontsize=9)
     axes.legend(fontsize=7, frameon=False, loc="upper left", bbox_to_anchor=(1, 1))
     return figure
 
 
-def epsilon(board: Board, curves: dict[str, list[Standing]]) -> Figure:
-    """What the strongest attack sees, over ε of a descriptor."""
-    (privacy,) = measures([PRIVACY])
-    figure, axes = _axes(5.6, 3.6, ", ".join([board.title, *board.facts[:3]]))
-    for (label, curve), mark in zip(curves.items(), marks(curves).values(), strict=True):
-        at = [_epsilon(one) for one in curve]
-        scores = [one.score for one in curve if one.score]
+def draw_epsilon(group: ComparisonGroup, curves: dict[str, list[Standing]]) -> Figure:
+    """Draw what the strongest attack recovers, over the ε of a descriptor."""
+    (privacy,) = list_measures([PRIVACY])
+    figure, axes = _create_axes(5.6, 3.6, ", ".join([group.title, *group.facts[:3]]))
+    for (label, curve), style in zip(curves.items(), choose_styles(curves).values(), strict=True):
+        at = [_get_epsilon(standing) for standing in curve]
+        scores = [standing.score for standing in curve if standing.score]
         axes.plot(
             at,
             [score.mean for score in scores],
-            color=mark.colour,
-            marker=mark.marker,
-            ls=mark.line,
+            color=style.colour,
+            marker=style.marker,
+            ls=style.line,
             ms=5,
             lw=1.3,
-            label=_brief(label),
+            label=_shorten(label),
         )
         low, high = [score.low for score in scores], [score.high for score in scores]
         if all(map(math.isfinite, low)):
-            axes.fill_between(at, low, high, color=mark.colour, alpha=0.12, lw=0)
+            axes.fill_between(at, low, high, color=style.colour, alpha=0.12, lw=0)
     axes.set_xlabel("ε of a descriptor", fontsize=9)
     axes.set_ylabel(f"{privacy.label} of the strongest attack", fontsize=9)
     axes.legend(fontsize=7, frameon=False)
     return figure
 
 
-def family_marks(found: Tradeoff) -> dict[str, Mark]:
-    """The names of the defenses, and how each is marked."""
-    return marks(sorted({point.standing.configuration["name"] for point in found.points}))
+def choose_family_styles(tradeoff: Tradeoff) -> dict[str, PlotStyle]:
+    """Return the style of each family of defenses."""
+    return choose_styles(sorted({point.standing.configuration["name"] for point in tradeoff.points}))
 
 
-def settings(found: Tradeoff) -> list[str]:
-    """What stands at each point: the defense's name, and those of its fields that differ among the points, `ldp ε 10`."""
-    configurations = [point.standing.configuration for point in found.points]
+def label_points(tradeoff: Tradeoff) -> list[str]:
+    """Return the label of each point, `ldp ε 10`: the defense's name, and those of its fields that differ among the points."""
+    configurations = [point.standing.configuration for point in tradeoff.points]
     texts = []
-    for one in configurations:
-        same_family = [other for other in configurations if other["name"] == one["name"]]
-        differing = [name for name in one if len({canonical(other.get(name)) for other in same_family}) > 1]
-        texts.append(
-            " ".join([one["name"], *(f"{'ε' if name == 'epsilon' else name} {setting(one[name])}" for name in differing)])
-        )
+    for configuration in configurations:
+        family = configuration["name"]
+        members = [other for other in configurations if other["name"] == family]
+        differing = [name for name in configuration if len({canonical_json(other.get(name)) for other in members}) > 1]
+        fields = (f"{'ε' if name == 'epsilon' else name} {format_setting(configuration[name])}" for name in differing)
+        texts.append(" ".join([family, *fields]))
     return texts
 
 
-def _curves(ranked: Sequence[Standing]) -> dict[str, list[Standing]]:
-    """Settings that differ in ε alone, at least two of them: defense without ε -> by ε."""
-    found: dict[str, list[Standing]] = {}
-    for one in ranked:
-        if one.rank is not None and math.isfinite(_epsilon(one)):
-            fixed = {name: value for name, value in one.configuration.items() if name != "epsilon"}
-            found.setdefault(labels([(fixed, None)])[0][0], []).append(one)
-    return {label: sorted(curve, key=_epsilon) for label, curve in found.items() if len({_epsilon(one) for one in curve}) > 1}
+def _collect_curves(ranked: Sequence[Standing]) -> dict[str, list[Standing]]:
+    """Return the settings that differ in ε alone, at least two of them, by their label without ε and in the order of ε."""
+    curves: dict[str, list[Standing]] = {}
+    for standing in ranked:
+        if standing.rank is not None and math.isfinite(_get_epsilon(standing)):
+            fixed = {name: value for name, value in standing.configuration.items() if name != "epsilon"}
+            curves.setdefault(build_labels([(fixed, None)])[0][0], []).append(standing)
+    return {label: sorted(curve, key=_get_epsilon) for label, curve in curves.items() if len(set(map(_get_epsilon, curve))) > 1}
 
 
-def _epsilon(standing: Standing) -> float:
-    told = standing.cells[0].head["privacy"]["epsilon_descriptor"]
-    return math.nan if told is None else float(told)
+def _get_epsilon(standing: Standing) -> float:
+    value = standing.experiments[0].metadata["privacy"]["epsilon_descriptor"]
+    return math.nan if value is None else float(value)
 
 
-def _axes(width: float, height: float, title: str) -> tuple[Figure, Axes]:
+def _create_axes(width: float, height: float, title: str) -> tuple[Figure, Axes]:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height), layout="constrained", dpi=150)
     axes = figure.subplots()
-    axes.set_title(drawable(title), fontsize=8, loc="left", wrap=True)
+    axes.set_title(escape_text(title), fontsize=8, loc="left", wrap=True)
     axes.spines[["top", "right"]].set_visible(False)
     axes.tick_params(labelsize=8)
     axes.grid(alpha=0.25, lw=0.5)
@@ -156,49 +159,49 @@ def _axes(width: float, height: float, title: str) -> tuple[Figure, Axes]:
     return figure, axes
 
 
-def _scatter(axes: Axes, at: Sequence[tuple[Interval, Interval]], mark: Mark, *, filled: bool, label: str | None) -> None:
-    """Marks with thin lines for the intervals, where there are any."""
+def _draw_points(axes: Axes, at: Sequence[tuple[Interval, Interval]], style: PlotStyle, *, filled: bool, label: str | None) -> None:
+    """Draw the points, with thin lines for the intervals that are finite."""
     if not at:
         return
-    across, up = [one for one, _ in at], [other for _, other in at]
+    across, up = [x for x, _ in at], [y for _, y in at]
     axes.errorbar(
         [value.mean for value in across],
         [value.mean for value in up],
-        xerr=_reach(across),
-        yerr=_reach(up),
-        fmt=mark.marker,
-        color=mark.colour,
-        mfc=mark.colour if filled else "white",
+        xerr=_error_bars(across),
+        yerr=_error_bars(up),
+        fmt=style.marker,
+        color=style.colour,
+        mfc=style.colour if filled else "white",
         ms=6,
         lw=0.7,
-        label=label and _brief(label),
+        label=label and _shorten(label),
         zorder=3,
     )
 
 
-def _reach(values: Sequence[Interval]) -> tuple[list[float], list[float]]:
+def _error_bars(values: Sequence[Interval]) -> tuple[list[float], list[float]]:
     low = [value.mean - value.low if math.isfinite(value.low) else 0.0 for value in values]
     return [max(0.0, one) for one in low], [max(0.0, v.high - v.mean) if math.isfinite(v.high) else 0.0 for v in values]
 
 
-def _write_settings(axes: Axes, found: Tradeoff) -> None:
-    """Write the settings beside the points, where there is room."""
+def _write_settings(axes: Axes, tradeoff: Tradeoff) -> None:
+    """Write the labels of the points where there is room."""
     size = (axes.bbox.width * 72 / axes.figure.dpi, axes.bbox.height * 72 / axes.figure.dpi)  # in points
-    means = [(point.utility.mean, point.privacy.mean) for point in found.points]
+    means = [(point.utility.mean, point.privacy.mean) for point in tradeoff.points]
     within = axes.transAxes.inverted().transform(axes.transData.transform(means))  # (n, 2) from 0 to 1
     points = [(x * size[0], (1 - y) * size[1]) for x, y in within]
-    texts = settings(found)
+    texts = label_points(tradeoff)
     sizes = [(LETTER[0] * min(len(text), BRIEF), LETTER[1]) for text in texts]
-    for text, place in zip(texts, place_labels(points, sizes, size), strict=True):
-        if place:
-            left, up = place[0] / size[0], 1 - place[1] / size[1]
-            axes.text(left, up, _brief(text), fontsize=7, color="0.2", va="center", transform=axes.transAxes)
+    for text, position in zip(texts, place_labels(points, sizes, size), strict=True):
+        if position:
+            left, up = position[0] / size[0], 1 - position[1] / size[1]
+            axes.text(left, up, _shorten(text), fontsize=7, color="0.2", va="center", transform=axes.transAxes)
 
 
-def _ranked(standing: Standing) -> str:
-    return _brief(f"{standing.rank}  {standing.defense}" if standing.rank is not None else f"unranked  {standing.defense}")
+def _label_standing(standing: Standing) -> str:
+    return _shorten(f"{standing.rank}  {standing.defense}" if standing.rank is not None else f"unranked  {standing.defense}")
 
 
-def _brief(text: str) -> str:
-    """Text that leaves room for the plot."""
-    return drawable(text if len(text) <= BRIEF else text[: BRIEF - 1] + "…")
+def _shorten(text: str) -> str:
+    """Return text that leaves room for the plot."""
+    return escape_text(text if len(text) <= BRIEF else text[: BRIEF - 1] + "…")

@@ -1,4 +1,4 @@
-"""Defenses ranked, each by the strongest attack on it: the one that brings back most of the photograph."""
+"""Ranking of defenses, each by the strongest attack on it: the one that reconstructs most of the photograph."""
 
 from __future__ import annotations
 
@@ -7,66 +7,69 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from bench.core.hashing import canonical
-from leaderboard.comparison import Board, Cell
+from bench.core.hashing import canonical_json
+from leaderboard.comparison import ComparisonGroup, GroupedExperiment
 from leaderboard.intervals import Interval
-from leaderboard.measures import PRIVACY, Measure, measures
+from leaderboard.measures import PRIVACY, Measure, list_measures
 
-# The attack whose network is trained for the very defense. Attackers that were made for another one make a defense look safe.
-ADAPTED = "dia"
+ADAPTED = "dia"  # the attack whose network is trained for the defense itself; any other makes a defense look safe
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Standing:
-    """One defense with one setting, and how it fares."""
+    """One defense with one setting, and its rank."""
 
     defense: str
-    cells: tuple[Cell, ...]
-    strongest: Cell | None  # None where no attack brought an image back
-    score: Interval | None  # of the strongest
-    unranked: str | None  # why it has no rank
+    experiments: tuple[GroupedExperiment, ...]
+    strongest: GroupedExperiment | None  # None where no attack made an image
+    score: Interval | None  # of the strongest attack
+    unranked_reason: str | None  # why it has no rank
     rank: int | None = None  # from 1, the most private; equal scores share one
 
     @property
     def configuration(self) -> dict[str, Any]:
-        return dict(self.cells[0].head["defense"])
+        return dict(self.experiments[0].metadata["defense"])
 
 
-def standings(board: Board) -> list[Standing]:
-    """All defenses of a board of attacks: those that are ranked by rank, and behind them the others."""
-    groups: dict[str, list[Cell]] = {}
-    for cell in board.cells:
-        groups.setdefault(canonical(cell.head["defense"]), []).append(cell)
-    (privacy,) = measures([PRIVACY])
-    found = [_standing(board, cells, privacy) for cells in groups.values()]
-    ranked = sorted((one for one in found if one.unranked is None), key=_score)
-    better = [sum(_score(other) < _score(one) for other in ranked) for one in ranked]
+def rank_defenses(group: ComparisonGroup) -> list[Standing]:
+    """Return all defenses of a group with attacks: the ranked ones by rank, then the others."""
+    by_defense: dict[str, list[GroupedExperiment]] = {}
+    for experiment in group.experiments:
+        by_defense.setdefault(canonical_json(experiment.metadata["defense"]), []).append(experiment)
+    (privacy,) = list_measures([PRIVACY])
+    standings = [_judge_defense(group, experiments, privacy) for experiments in by_defense.values()]
+    ranked = sorted((standing for standing in standings if standing.unranked_reason is None), key=_mean_score)
     return [
-        *(dataclasses.replace(one, rank=1 + above) for one, above in zip(ranked, better, strict=True)),
-        *(one for one in found if one.unranked is not None),
+        *(dataclasses.replace(one, rank=1 + sum(_mean_score(other) < _mean_score(one) for other in ranked)) for one in ranked),
+        *(standing for standing in standings if standing.unranked_reason is not None),
     ]
 
 
-def _standing(board: Board, cells: Sequence[Cell], privacy: Measure) -> Standing:
-    scores = [(score, cell) for cell in cells if (score := board.average(cell, privacy)) is not None]
+def _judge_defense(group: ComparisonGroup, experiments: Sequence[GroupedExperiment], privacy: Measure) -> Standing:
+    scores = [(score, one) for one in experiments if (score := group.average(one, privacy)) is not None]
     score, strongest = max(scores, key=lambda pair: pair[0].mean, default=(None, None))
     return Standing(
-        defense=cells[0].defense, cells=tuple(cells), strongest=strongest, score=score, unranked=_unranked(board, cells, score)
+        defense=experiments[0].defense,
+        experiments=tuple(experiments),
+        strongest=strongest,
+        score=score,
+        unranked_reason=_explain_unranked(group, experiments, score),
     )
 
 
-def _unranked(board: Board, cells: Sequence[Cell], score: Interval | None) -> str | None:
-    adapted = [cell for cell in cells if cell.head["attack"] is not None and cell.head["attack"]["name"] == ADAPTED]
+def _explain_unranked(group: ComparisonGroup, experiments: Sequence[GroupedExperiment], score: Interval | None) -> str | None:
+    """Return why a defense has no rank, or None if it has one."""
+    adapted = [one for one in experiments if (one.metadata["attack"] or {}).get("name") == ADAPTED]
     if not adapted:
         return f"no adapted attacker was run ({ADAPTED})"
-    if all(cell.reason for cell in adapted):
+    if all(one.reason for one in adapted):
         return adapted[0].reason
-    for cell in cells:  # the mean over those that were done might be of easy ones
-        if board.missing(cell):
-            return f"{cell.attack} has done {len(board.whole(cell))} of {len(board.units)}"
+    for one in experiments:  # the completed samples alone might be the easy ones
+        if group.count_missing(one):
+            return f"{one.attack} has done {len(group.complete_samples(one))} of {len(group.samples)}"
     return None if score else "no attack made an image"
 
 
-def _score(standing: Standing) -> float:
+def _mean_score(standing: Standing) -> float:
     assert standing.score is not None
     return standing.score.mean

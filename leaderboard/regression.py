@@ -22,24 +22,24 @@ from typing import Any, Literal
 import numpy as np
 from scipy import stats
 
-from bench.core.hashing import canonical
+from bench.core.hashing import canonical_json
 from bench.runner.records import Record
 from leaderboard.intervals import interval
-from leaderboard.measures import measures
-from leaderboard.tables import labels
+from leaderboard.measures import list_measures
+from leaderboard.tables import build_labels
 
 Verdict = Literal["worse", "weaker", "missing", "better", "new", "same"]  # the gravest first
 CONFIDENCE = 0.999
 # Eight times what bf16 in the place of float32 made of the shipped networks: 0.12% at most, of means over seven photographs.
-RELATIVE_FLOOR = 0.01  # of the baseline's mean
-ABSOLUTE_FLOOR = 0.001  # in the metric's unit
-PROMISE = "epsilon_descriptor"
+RELATIVE_TOLERANCE = 0.01  # of the baseline's mean
+ABSOLUTE_TOLERANCE = 0.001  # in the metric's unit
+GUARANTEE = "epsilon_descriptor"
 
-Samples = Mapping[str, Sequence[float]]  # unit -> its values, one a seed
+SampleValues = Mapping[str, Sequence[float]]  # unit -> its values, one a seed
 
 
 @dataclass(frozen=True, kw_only=True)
-class Finding:
+class RegressionResult:
     """One metric of one cell, or the whole cell where `metric` is empty."""
 
     verdict: Verdict
@@ -48,33 +48,33 @@ class Finding:
     metric: str = ""
     before: float = math.nan  # means over the units that both have
     after: float = math.nan
-    tolerance: float = math.nan
-    told: str = ""  # what a reader should know of it
+    compute_tolerance: float = math.nan
+    note: str = ""  # what a reader should know of it
 
 
-def compare(baseline: Iterable[Record], results: Iterable[Record]) -> list[Finding]:
+def compare(baseline: Iterable[Record], results: Iterable[Record]) -> list[RegressionResult]:
     """Every metric that has a better and a worse, of every cell that either side has, the gravest findings first.
 
     An attacker who recovers less of the same defense, its source being what it was, is a `weaker` attack: no defense gets better
     by that. Where records do not tell the source, it is taken to be the same.
     """
-    before, after = _cells(baseline), _cells(results)
+    before, after = _group_experiments(baseline), _group_experiments(results)
     heads = [(cells[0]["defense"], cells[0]["attack"]) for cells in {**after, **before}.values()]
-    names = dict(zip({**after, **before}, labels(heads), strict=True))
-    found: list[Finding] = []
+    names = dict(zip({**after, **before}, build_labels(heads), strict=True))
+    found: list[RegressionResult] = []
     for key, (defense, attack) in names.items():
-        finding = functools.partial(Finding, defense=defense, attack=attack)
+        finding = functools.partial(RegressionResult, defense=defense, attack=attack)
         if key not in after:
-            found.append(finding(verdict="missing", told="no results for this cell of the baseline"))
+            found.append(finding(verdict="missing", note="no results for this cell of the baseline"))
         elif key not in before:
-            found.append(finding(verdict="new", told="the baseline does not have this cell"))
+            found.append(finding(verdict="new", note="the baseline does not have this cell"))
         else:
-            found += _cell(before[key], after[key], finding)
+            found += _compare_experiment(before[key], after[key], finding)
     order = Verdict.__args__  # type: ignore[attr-defined]
     return sorted(found, key=lambda one: order.index(one.verdict))
 
 
-def tolerance(before: Samples, after: Samples, floor: float) -> float:
+def compute_tolerance(before: SampleValues, after: SampleValues, floor: float) -> float:
     """How far the means of two sides may be apart, by the rule at the top of this file. Both have the same units, at least one.
 
     One unit under one seed has no spread to be seen; there the floor alone decides.
@@ -93,91 +93,91 @@ def tolerance(before: Samples, after: Samples, floor: float) -> float:
     return max(floor, likely.high - likely.mean, likely.mean - likely.low)
 
 
-def _cells(records: Iterable[Record]) -> dict[str, list[Record]]:
+def _group_experiments(records: Iterable[Record]) -> dict[str, list[Record]]:
     """The latest record of each unit and seed, by what all of a cell share but the seed."""
-    latest = {(record["cell_id"], record["unit"]): record for record in records}
+    latest = {(record["experiment_id"], record["sample"]): record for record in records}
     cells: dict[str, list[Record]] = {}
     for record in latest.values():
-        cells.setdefault(_configuration(record), []).append(record)
+        cells.setdefault(_experiment_key(record), []).append(record)
     return cells
 
 
-def _configuration(record: Record) -> str:
+def _experiment_key(record: Record) -> str:
     """What `cell_id` hashes, without the seed; and without the metrics' settings, so that one more metric makes no other cell."""
     dataset = {name: value for name, value in record["dataset"].items() if name not in ("name", "spec")}
     parts = ("schema", "task", "task_settings", "defense", "attack")
-    return canonical([dataset, *(record.get(part) for part in parts)])
+    return canonical_json([dataset, *(record.get(part) for part in parts)])
 
 
-def _cell(before: list[Record], after: list[Record], finding: functools.partial[Finding]) -> Iterator[Finding]:
-    had, have = _done(before), _done(after)
+def _compare_experiment(before: list[Record], after: list[Record], finding: functools.partial[RegressionResult]) -> Iterator[RegressionResult]:
+    had, have = _group_completed(before), _group_completed(after)
     lost = sorted(had.keys() - have.keys())
     if lost:
-        reasons = {record["unit"]: record["reason"] for record in after if record["status"] != "ok"}
+        reasons = {record["sample"]: record["reason"] for record in after if record["status"] != "ok"}
         told = f"{len(lost)} of {len(had)} units: {lost[0]}" + (f": {reason}" if (reason := reasons.get(lost[0])) else "")
-        yield finding(verdict="missing", told=told)
+        yield finding(verdict="missing", note=told)
     shared = [unit for unit in had if unit in have]
     if not shared:
         return
     attacked = before[0]["attack"] is not None
-    changed = [part for part in ("defense", "attack") if _source(before, part) != _source(after, part)]
-    for metric in measures(sorted({name for unit in shared for record in had[unit] for name in record["metrics"]})):
-        old, new = (_values(side, shared, metric.name) for side in (had, have))
+    changed = [part for part in ("defense", "attack") if _get_source(before, part) != _get_source(after, part)]
+    for metric in list_measures(sorted({name for unit in shared for record in had[unit] for name in record["metrics"]})):
+        old, new = (_collect_values(side, shared, metric.name) for side in (had, have))
         units = [unit for unit in old if unit in new]
         if metric.better == 0 or not units:
             continue
-        if _settings(before, metric.name) != _settings(after, metric.name):
-            yield finding(verdict="missing", metric=metric.name, told="it is measured with other settings")
+        if _get_settings(before, metric.name) != _get_settings(after, metric.name):
+            yield finding(verdict="missing", metric=metric.name, note="it is measured with other settings")
             continue
         old, new = ({unit: side[unit] for unit in units} for side in (old, new))
         first, second = _mean(old), _mean(new)
-        allowed = tolerance(old, new, ABSOLUTE_FLOOR + RELATIVE_FLOOR * abs(first))
-        verdict = _verdict(metric.better * (second - first), allowed, attacked, changed)
-        told = _told(verdict, attacked, changed)
-        yield finding(verdict=verdict, metric=metric.name, before=first, after=second, tolerance=allowed, told=told)
-    yield from _promise(had, have, shared, finding)
+        allowed = compute_tolerance(old, new, ABSOLUTE_TOLERANCE + RELATIVE_TOLERANCE * abs(first))
+        verdict = _judge(metric.better * (second - first), allowed, attacked, changed)
+        told = _explain(verdict, attacked, changed)
+        yield finding(verdict=verdict, metric=metric.name, before=first, after=second, tolerance=allowed, note=told)
+    yield from _compare_guarantee(had, have, shared, finding)
 
 
-def _promise(
-    had: Mapping[str, list[Record]], have: Mapping[str, list[Record]], shared: Sequence[str], finding: functools.partial[Finding]
-) -> Iterator[Finding]:
+def _compare_guarantee(
+    had: Mapping[str, list[Record]], have: Mapping[str, list[Record]], shared: Sequence[str], finding: functools.partial[RegressionResult]
+) -> Iterator[RegressionResult]:
     """What is promised of a descriptor: it has no spread, and no tolerance."""
     old, new = (side[shared[0]][0]["privacy"] for side in (had, have))
-    first, second = (math.inf if side[PROMISE] is None else float(side[PROMISE]) for side in (old, new))
+    first, second = (math.inf if side[GUARANTEE] is None else float(side[GUARANTEE]) for side in (old, new))
     if first == second and old["guarantee"] == new["guarantee"]:
         return
     verdict: Verdict = "better" if second < first else "worse"
     told = f"the guarantee was {old['guarantee']}, and is {new['guarantee']}"
-    yield finding(verdict=verdict, metric=PROMISE, before=first, after=second, tolerance=0.0, told=told)
+    yield finding(verdict=verdict, metric=GUARANTEE, before=first, after=second, tolerance=0.0, note=told)
 
 
-def _done(records: Iterable[Record]) -> dict[str, list[Record]]:
+def _group_completed(records: Iterable[Record]) -> dict[str, list[Record]]:
     done: dict[str, list[Record]] = {}
     for record in records:
         if record["status"] == "ok":
-            done.setdefault(record["unit"], []).append(record)
+            done.setdefault(record["sample"], []).append(record)
     return done
 
 
-def _values(side: Mapping[str, list[Record]], units: Iterable[str], metric: str) -> dict[str, list[float]]:
+def _collect_values(side: Mapping[str, list[Record]], units: Iterable[str], metric: str) -> dict[str, list[float]]:
     """The known values of each unit that has any."""
     found = {unit: [value for record in side[unit] if (value := record["metrics"].get(metric)) is not None] for unit in units}
     return {unit: values for unit, values in found.items() if values}
 
 
-def _mean(side: Samples) -> float:
+def _mean(side: SampleValues) -> float:
     return float(np.mean([np.mean(values) for values in side.values()]))
 
 
-def _source(records: Sequence[Record], part: str) -> Any:
+def _get_source(records: Sequence[Record], part: str) -> Any:
     return (records[-1].get("sources") or {}).get(part)
 
 
-def _settings(records: Sequence[Record], metric: str) -> Any:
+def _get_settings(records: Sequence[Record], metric: str) -> Any:
     return (records[-1].get("metric_settings") or {}).get(metric)
 
 
-def _verdict(gain: float, allowed: float, attacked: bool, changed: Sequence[str]) -> Verdict:
+def _judge(gain: float, allowed: float, attacked: bool, changed: Sequence[str]) -> Verdict:
     """`gain` is in the defender's favour."""
     if abs(gain) <= allowed:
         return "same"
@@ -186,7 +186,7 @@ def _verdict(gain: float, allowed: float, attacked: bool, changed: Sequence[str]
     return "weaker" if attacked and "defense" not in changed else "better"
 
 
-def _told(verdict: Verdict, attacked: bool, changed: Sequence[str]) -> str:
+def _explain(verdict: Verdict, attacked: bool, changed: Sequence[str]) -> str:
     if verdict == "weaker":
         return "the attacker recovers less of a defense whose source is what it was"
     if verdict == "worse" and attacked:

@@ -1,16 +1,13 @@
-"""What a regression check found, as a table and as annotations of GitHub's."""
+"""The results of a regression check as a table, and as annotations of GitHub's."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
-from leaderboard.regression import Finding, Verdict
-from leaderboard.tables import number
-
-if TYPE_CHECKING:
-    from rich.table import Table
+from bench.core.table import Table, build_table
+from leaderboard.regression import RegressionResult, Verdict
+from leaderboard.tables import format_number
 
 LEVEL: dict[Verdict, str] = {
     "worse": "error",
@@ -20,47 +17,40 @@ LEVEL: dict[Verdict, str] = {
     "new": "notice",
     "same": "notice",
 }
-COLUMNS = ("verdict", "defense", "attack", "metric", "before", "after", "tolerance")
+COLUMNS = ("verdict", "defense", "attack", "metric", "before", "after", "tolerance", "note")
+TEXT = ("verdict", "defense", "attack", "metric", "note")  # the other columns are numbers
 
 
-def summary(found: Sequence[Finding]) -> str:
-    """One line: how many of each verdict."""
-    counts = Counter(finding.verdict for finding in found)
+def summarize(results: Sequence[RegressionResult]) -> str:
+    """Return one line: how many results there are of each verdict."""
+    counts = Counter(result.verdict for result in results)
     return ", ".join(f"{counts[verdict]} {verdict}" for verdict in LEVEL if counts[verdict]) or "nothing to compare"
 
 
-def to_rich(found: Sequence[Finding]) -> Table:
-    """A row a finding."""
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(title="Against the baseline", title_justify="left")
-    for column in (*COLUMNS, "note"):
-        table.add_column(column, overflow="fold", justify="right" if column in COLUMNS[4:] else "left")
-    for finding in found:
-        table.add_row(*(Text(cell) for cell in (*_cells(finding), finding.told)))
-    return table
+def build_results_table(results: Sequence[RegressionResult]) -> Table:
+    """Return a table with a row for each result."""
+    return build_table(COLUMNS, map(_format_row, results), text=TEXT, heading="Against the baseline")
 
 
-def to_github(finding: Finding) -> str:
-    """A workflow command (GitHub's documentation, "Workflow commands"), which shows as an annotation."""
-    title = f"{finding.verdict}: {finding.defense} against {finding.attack}"
-    metric = f"{finding.metric} was {number(finding.before)}, is {number(finding.after)}, may move by {number(finding.tolerance)}"
-    message = "; ".join(part for part in (metric if finding.metric else "", finding.told) if part)
-    return f"::{LEVEL[finding.verdict]} title={_property(title)}::{_data(message or finding.verdict)}"
+def to_github(result: RegressionResult) -> str:
+    """Return a workflow command (GitHub's documentation, "Workflow commands"), which shows as an annotation."""
+    title = f"{result.verdict}: {result.defense} against {result.attack}"
+    before, after, tolerance = map(format_number, (result.before, result.after, result.tolerance))
+    metric = f"{result.metric} was {before}, is {after}, may move by {tolerance}" if result.metric else ""
+    message = "; ".join(part for part in (metric, result.note) if part)
+    return f"::{LEVEL[result.verdict]} title={_escape_property(title)}::{_escape_data(message or result.verdict)}"
 
 
-def _cells(finding: Finding) -> tuple[str, ...]:
-    numbers = (finding.before, finding.after, finding.tolerance)
-    shown = map(number, numbers) if finding.metric else ("", "", "")
-    return finding.verdict, finding.defense, finding.attack, finding.metric, *shown
+def _format_row(result: RegressionResult) -> tuple[str, ...]:
+    numbers = map(format_number, (result.before, result.after, result.tolerance)) if result.metric else [""] * 3
+    return result.verdict, result.defense, result.attack, result.metric, *numbers, result.note
 
 
-def _data(text: str) -> str:
+def _escape_data(text: str) -> str:
     """As actions/toolkit's `escapeData`."""
     return text.replace("%", "%25").replace("\r", "%0D").replace("\n", "%0A")
 
 
-def _property(text: str) -> str:
+def _escape_property(text: str) -> str:
     """As actions/toolkit's `escapeProperty`."""
-    return _data(text).replace(":", "%3A").replace(",", "%2C")
+    return _escape_data(text).replace(":", "%3A").replace(",", "%2C")

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.core.errors import UserError
-from leaderboard.regression import Finding, Verdict
+from leaderboard.regression import RegressionResult, Verdict
 
 TOLERANCE = 2.0  # times as much as the baseline: what a busy machine makes of it is less
 FLOORS = ("bare_product", "random words", "faiss")  # in the names of benchmarks that others are divided by
@@ -23,7 +23,7 @@ FLOORS = ("bare_product", "random words", "faiss")  # in the names of benchmarks
 Ratios = Mapping[str, float]
 
 
-def read(path: Path) -> Ratios:
+def load_ratios(path: Path) -> Ratios:
     """The committed ratios, by benchmark.
 
     Raises
@@ -31,13 +31,13 @@ def read(path: Path) -> Ratios:
     UserError
         if the file is missing, or holds something else.
     """
-    found = _json(path)
+    found = _load_json(path)
     if not isinstance(found, dict) or not all(isinstance(value, (int, float)) for value in found.values()):
         raise UserError(f"{path}: expected ratios, a number for each benchmark's name")
     return found
 
 
-def ratios(path: Path) -> Ratios:
+def compute_ratios(path: Path) -> Ratios:
     """Shortest time of each benchmark, divided by that of its group's quickest floor, from what `--benchmark-json` wrote.
 
     Raises
@@ -45,7 +45,7 @@ def ratios(path: Path) -> Ratios:
     UserError
         if the file is missing, or holds something else.
     """
-    found = _json(path)
+    found = _load_json(path)
     if not isinstance(found, dict) or "benchmarks" not in found:
         raise UserError(f"{path}: not what pytest --benchmark-json wrote")
     groups: dict[str, dict[str, float]] = {}
@@ -59,13 +59,13 @@ def ratios(path: Path) -> Ratios:
     return measured
 
 
-def compare(baseline: Ratios, measured: Ratios) -> list[Finding]:
+def compare(baseline: Ratios, measured: Ratios) -> list[RegressionResult]:
     """A finding for each benchmark of either side."""
-    return [_finding(name, baseline.get(name), measured.get(name)) for name in sorted({*baseline, *measured})]
+    return [_compare_ratio(name, baseline.get(name), measured.get(name)) for name in sorted({*baseline, *measured})]
 
 
-def _finding(name: str, before: float | None, after: float | None) -> Finding:
-    finding = functools.partial(Finding, defense=name, attack="its floor")
+def _compare_ratio(name: str, before: float | None, after: float | None) -> RegressionResult:
+    finding = functools.partial(RegressionResult, defense=name, attack="its floor")
     if before is None or after is None:
         return finding(verdict="new" if before is None else "missing")
     verdict: Verdict = "worse" if after > before * TOLERANCE else "better" if after < before / TOLERANCE else "same"
@@ -77,7 +77,7 @@ def _is_floor(name: str) -> bool:
     return any(part in name for part in FLOORS)
 
 
-def _json(path: Path) -> Any:
+def _load_json(path: Path) -> Any:
     if not path.is_file():
         raise UserError(f"{path}: no such file")
     try:

@@ -1,4 +1,4 @@
-"""Privacy against utility: what the strongest attack sees of a defense, beside what a server can do with it."""
+"""Privacy against utility: what the strongest attack recovers of a defense, and what a server can do with it."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bench.core.hashing import canonical
-from leaderboard.comparison import Board, Cell
+from bench.core.hashing import canonical_json
+from leaderboard.comparison import ComparisonGroup, GroupedExperiment
 from leaderboard.intervals import Interval
-from leaderboard.measures import PRIVACY, UTILITY, Measure, measures
-from leaderboard.ranking import Standing, standings
+from leaderboard.measures import PRIVACY, UTILITY, Measure, list_measures
+from leaderboard.ranking import Standing, rank_defenses
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -21,20 +21,20 @@ class Point:
     """One defense with one setting."""
 
     standing: Standing
-    cell: Cell  # of the strongest attack
-    served: Cell  # what tells the utility
-    privacy: Interval  # the less the better
-    utility: Interval  # the more the better
-    best: bool  # on the Pareto front
-    own_words: bool  # whether the two were measured with other dictionaries
+    attack_experiment: GroupedExperiment  # of the strongest attack
+    utility_experiment: GroupedExperiment
+    privacy: Interval  # smaller is better
+    utility: Interval  # larger is better
+    on_front: bool  # the Pareto front
+    own_dictionaries: bool  # the two experiments use different dictionaries
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Tradeoff:
-    """The points of one board of attacks and one board of utility, under one condition such as day or night."""
+    """The points of one group with attacks and one utility group, under one condition such as day or night."""
 
-    attacked: Board
-    served: Board
+    attack_group: ComparisonGroup
+    utility_group: ComparisonGroup
     condition: str | None
     privacy: Measure
     utility: Measure
@@ -42,90 +42,105 @@ class Tradeoff:
 
     @property
     def caption(self) -> str:
-        """What was measured on what."""
-        here, there = self.attacked.head["dataset"], self.served.head["dataset"]
+        """The measures, the datasets and the settings of the server's task."""
+        attacked, served = self.attack_group.metadata["dataset"], self.utility_group.metadata["dataset"]
         condition = f"{self.condition.capitalize()}: " if self.condition else ""
-        how = f" ({self.served.settings})" if self.served.settings else ""
-        if here["hash"] == there["hash"]:
-            return f"{condition}{self.privacy.label} and {self.utility.label} on {here['name']}{how}"
-        words = "; words of a dictionary are those of each" if any(point.own_words for point in self.points) else ""
-        return f"{condition}{self.privacy.label} on {here['name']}, {self.utility.label} on {there['name']}{how}{words}"
+        settings = f" ({self.utility_group.settings})" if self.utility_group.settings else ""
+        if attacked["hash"] == served["hash"]:
+            return f"{condition}{self.privacy.label} and {self.utility.label} on {attacked['name']}{settings}"
+        words = "; words of a dictionary are those of each" if any(point.own_dictionaries for point in self.points) else ""
+        return f"{condition}{self.privacy.label} on {attacked['name']}, {self.utility.label} on {served['name']}{settings}{words}"
 
     @property
     def front(self) -> list[Point]:
-        """Its Pareto front, from the most private to the most useful."""
-        return sorted((point for point in self.points if point.best), key=lambda point: point.utility.mean)
+        """The Pareto front, from the most private point to the most useful."""
+        return sorted((point for point in self.points if point.on_front), key=lambda point: point.utility.mean)
 
 
-def tradeoffs(attacked: Board, boards: Sequence[Board]) -> list[Tradeoff]:
-    """One for each condition of each board of utility that shares extractor, seeds and source with a board of attacks.
+def build_tradeoffs(attack_group: ComparisonGroup, groups: Sequence[ComparisonGroup]) -> list[Tradeoff]:
+    """Return one tradeoff for each condition of each utility group with the same extractor, seeds and source.
 
-    Boards of the same photographs come before others, which are only looked at where there is none; and localization before
-    matching.
+    Groups of other photographs count only where no group has the same, and matching only where localization is missing.
     """
-    for utility in measures(UTILITY):
-        having = [board for board in boards if utility in board.measures and _alike(board) == _alike(attacked)]
-        same = [board for board in having if board.head["dataset"]["hash"] == attacked.head["dataset"]["hash"]]
-        made = [_tradeoff(attacked, board, utility, condition) for board in same or having for condition in board.conditions]
-        if found := [one for one in made if one.points]:
-            return found
+    for utility in list_measures(UTILITY):
+        candidates = [one for one in groups if utility in one.measures and _shared_key(one) == _shared_key(attack_group)]
+        same = [one for one in candidates if one.metadata["dataset"]["hash"] == attack_group.metadata["dataset"]["hash"]]
+        tradeoffs = [
+            _build_tradeoff(attack_group, group, utility, condition)
+            for group in same or candidates
+            for condition in group.conditions
+        ]
+        if filled := [tradeoff for tradeoff in tradeoffs if tradeoff.points]:
+            return filled
     return []
 
 
 def pareto(cost: ArrayLike, gain: ArrayLike) -> NDArray[np.bool_]:
-    """Which of (n,) points no other one dominates: costs no more and gains no less, and is better in one of the two. -> (n,)"""
+    """Return which of (n,) points no other point dominates, as (n,) booleans.
+
+    A point dominates another if it costs no more, gains no less, and is better in one of the two.
+    """
     costs, gains = np.asarray(cost, dtype=np.float64), np.asarray(gain, dtype=np.float64)
     no_worse = (costs[None] <= costs[:, None]) & (gains[None] >= gains[:, None])
     better = (costs[None] < costs[:, None]) | (gains[None] > gains[:, None])
     return np.logical_not(np.logical_and(no_worse, better).any(axis=1))
 
 
-def _tradeoff(attacked: Board, served: Board, utility: Measure, condition: str | None) -> Tradeoff:
-    (privacy,) = measures([PRIVACY])
-    whole = [cell for cell in served.cells if not cell.reason and not served.missing(cell)]
+def _build_tradeoff(
+    attack_group: ComparisonGroup, utility_group: ComparisonGroup, utility: Measure, condition: str | None
+) -> Tradeoff:
+    (privacy,) = list_measures([PRIVACY])
+    complete = [one for one in utility_group.experiments if not one.reason and not utility_group.count_missing(one)]
+    privacy_condition = condition if condition in attack_group.conditions else None
     pairs = []
-    for standing in standings(attacked):
-        cell, strongest = _same_defense(standing, whole), standing.strongest
-        gained = served.average(cell, utility, condition) if cell else None
-        seen = (
-            attacked.average(strongest, privacy, condition if condition in attacked.conditions else None) if strongest else None
-        )
-        if cell and strongest and gained and seen:
-            pairs.append((standing, strongest, cell, seen, gained))
+    for standing in rank_defenses(attack_group):
+        served, strongest = _find_same_defense(standing, complete), standing.strongest
+        gain = utility_group.average(served, utility, condition) if served else None
+        loss = attack_group.average(strongest, privacy, privacy_condition) if strongest else None
+        if served and strongest and gain and loss:
+            pairs.append((standing, strongest, served, loss, gain))
     ranked = [pair for pair in pairs if pair[0].rank is not None]  # an unranked one may look more private than it is
     front = pareto([pair[3].mean for pair in ranked], [pair[4].mean for pair in ranked])
-    best = {pair[1].key for pair, on_it in zip(ranked, front, strict=True) if on_it}
+    best = {pair[1].key for pair, on_front in zip(ranked, front, strict=True) if on_front}
     points = tuple(
         Point(
             standing=standing,
-            cell=cell,
-            served=other,
-            privacy=seen,
-            utility=gained,
-            best=cell.key in best,
-            own_words=cell.head["defense"] != other.head["defense"],
+            attack_experiment=strongest,
+            utility_experiment=served,
+            privacy=loss,
+            utility=gain,
+            on_front=strongest.key in best,
+            own_dictionaries=strongest.metadata["defense"] != served.metadata["defense"],
         )
-        for standing, cell, other, seen, gained in pairs
+        for standing, strongest, served, loss, gain in pairs
     )
-    return Tradeoff(attacked=attacked, served=served, condition=condition, privacy=privacy, utility=utility, points=points)
+    return Tradeoff(
+        attack_group=attack_group,
+        utility_group=utility_group,
+        condition=condition,
+        privacy=privacy,
+        utility=utility,
+        points=points,
+    )
 
 
-def _same_defense(standing: Standing, served: Sequence[Cell]) -> Cell | None:
-    """The cell of a server's board with the same defense and setting.
+def _find_same_defense(standing: Standing, experiments: Sequence[GroupedExperiment]) -> GroupedExperiment | None:
+    """Return the experiment of a utility group with the same defense and setting.
 
-    On other data a defense may have other files, such as the dictionary of the place that is served: there it is the same if all
-    else is, and no second one is so, too.
+    On another dataset a defense may have other files, such as the dictionary of that scene. There the defense is the same if all
+    other fields are equal and no second experiment qualifies.
     """
-    equal = [cell for cell in served if cell.head["defense"] == standing.configuration]
-    if equal or any(cell.head["dataset"]["hash"] == standing.cells[0].head["dataset"]["hash"] for cell in served):
+    equal = [one for one in experiments if one.metadata["defense"] == standing.configuration]
+    content = standing.experiments[0].metadata["dataset"]["hash"]
+    if equal or any(one.metadata["dataset"]["hash"] == content for one in experiments):
         return equal[0] if equal else None
-    alike = [cell for cell in served if _without_files(cell.head["defense"]) == _without_files(standing.configuration)]
+    alike = [one for one in experiments if _drop_files(one.metadata["defense"]) == _drop_files(standing.configuration)]
     return alike[0] if len(alike) == 1 else None
 
 
-def _without_files(configuration: Mapping[str, Any]) -> dict[str, Any]:
+def _drop_files(configuration: Mapping[str, Any]) -> dict[str, Any]:
     return {name: None if str(value).startswith("sha256:") else value for name, value in configuration.items()}
 
 
-def _alike(board: Board) -> str:
-    return canonical([board.head["dataset"]["extractor"], board.seeds, board.head["environment"]["source"]])
+def _shared_key(group: ComparisonGroup) -> str:
+    return canonical_json([group.metadata["dataset"]["extractor"], group.seeds, group.metadata["environment"]["source"]])

@@ -8,7 +8,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from bench.api import Metric
-from bench.geometry.metric_inputs import descriptor_pair, directions
+from bench.geometry.metric_inputs import normalize_rows, validate_descriptors
 from bench.types import Floats
 
 
@@ -27,7 +27,7 @@ class Angle(Metric):
 
     def __call__(self, truth: Floats, estimate: Floats) -> float:
         # (N, D) each
-        u, v = map(directions, descriptor_pair(truth, estimate))
+        u, v = map(normalize_rows, validate_descriptors(truth, estimate))
         halves = np.arctan2(np.linalg.norm(u - v, axis=1), np.linalg.norm(u + v, axis=1))  # (N,)
         return float(np.degrees(2 * halves).mean())
 

@@ -1,4 +1,4 @@
-"""Whether a face detector still finds the faces: the cascade of local binary patterns that scikit-image's wheel carries."""
+"""Faces that a detector still finds: the cascade of local binary patterns shipped in scikit-image's wheel."""
 
 from __future__ import annotations
 
@@ -11,65 +11,65 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from bench.api import Metric
-from bench.geometry.metric_inputs import Doubles, image_pair
+from bench.geometry.metric_inputs import Doubles, validate_images
 from bench.types import Floats
 
 
 @dataclass(frozen=True, kw_only=True)
 class Face(Metric):
-    """Share of the faces found in the photograph that are found again at the same place; none where it shows no face.
+    """Fraction of the photograph's detected faces that are detected again at the same position; none without a face.
 
-    A face is found again if a detection in the estimate overlaps it by an intersection over union of at least `overlap`, so
-    that a face which a network dreams up elsewhere does not count. It says that somebody is seen, not who.
+    A face is detected again if a detection in the estimate overlaps it by an intersection over union of at least `overlap`. So a
+    face that a network hallucinates elsewhere does not count. The metric detects a person, not an identity.
     """
 
     compares: ClassVar[Literal["images", "descriptors"]] = "images"
-    unit: ClassVar[str] = "share"
+    unit: ClassVar[str] = "fraction"
     range: ClassVar[tuple[float, float]] = (0.0, 1.0)
     higher_is_better_for: ClassVar[Literal["attacker", "defender"]] = "attacker"
-    # The detector's own; the window of its training is 24 pixels wide.
+    # Of the detector, whose training window is 24 pixels wide, and of the comparison.
     parameters: ClassVar[Mapping[str, Any]] = MappingProxyType(
         {"cascade": "lbpcascade_frontalface", "scale_factor": 1.1, "step_ratio": 1.0, "smallest": 32, "overlap": 0.5}
     )
 
     def __call__(self, truth: Floats, estimate: Floats) -> float | None:
         # (H, W, 3) in [0, 1] each
-        true, estimated = image_pair(truth, estimate)
-        faces = _faces(true.tobytes(), true.shape)
+        true, estimated = validate_images(truth, estimate)
+        faces = _detect_faces(true.tobytes(), true.shape)
         if len(faces) == 0:
             return None
-        again = _faces(estimated.tobytes(), estimated.shape)
-        overlaps = overlap(faces[:, None], again[None])  # (F, G)
+        again = _detect_faces(estimated.tobytes(), estimated.shape)
+        overlaps = compute_overlap(faces[:, None], again[None])  # (F, G)
         return float((overlaps >= self.parameters["overlap"]).any(axis=1).mean())
 
 
-def overlap(one: Doubles, other: Doubles) -> Doubles:
+def compute_overlap(one: Doubles, other: Doubles) -> Doubles:
     """Intersection over union of boxes (..., 4): top, left, height, width in pixels. -> (...)"""
     low = np.maximum(one[..., :2], other[..., :2])
     high = np.minimum(one[..., :2] + one[..., 2:], other[..., :2] + other[..., 2:])
-    shared = np.clip(high - low, 0, None).prod(axis=-1)
-    return shared / (one[..., 2:].prod(axis=-1) + other[..., 2:].prod(axis=-1) - shared)
+    intersection = np.clip(high - low, 0, None).prod(axis=-1)
+    return intersection / (one[..., 2:].prod(axis=-1) + other[..., 2:].prod(axis=-1) - intersection)
 
 
-# The photograph is the same for every attack on it.
+# All attacks on a photograph share its detections.
 @functools.lru_cache(maxsize=2)
-def _faces(pixels: bytes, shape: tuple[int, int, int]) -> Doubles:
-    """Detections in a float64 image as boxes (F, 4)."""
+def _detect_faces(pixels: bytes, shape: tuple[int, int, int]) -> Doubles:
+    """Detect faces in a float64 image, as boxes (F, 4)."""
     image = np.frombuffer(pixels).reshape(shape)
     smallest, settings = Face.parameters["smallest"], Face.parameters
-    found = _detector().detect_multi_scale(
+    detections = _load_detector().detect_multi_scale(
         img=np.rint(image * 255).astype(np.uint8),
         scale_factor=settings["scale_factor"],
         step_ratio=settings["step_ratio"],
         min_size=(smallest, smallest),
         max_size=shape[:2],
     )
-    boxes = sorted((face["r"], face["c"], face["height"], face["width"]) for face in found)
+    boxes = sorted((face["r"], face["c"], face["height"], face["width"]) for face in detections)
     return np.array(boxes, dtype=np.float64).reshape(-1, 4)
 
 
 @functools.cache
-def _detector() -> Any:
+def _load_detector() -> Any:
     from skimage.data import lbp_frontal_face_cascade_filename
     from skimage.feature import Cascade
 

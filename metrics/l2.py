@@ -8,7 +8,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from bench.api import Metric
-from bench.geometry.metric_inputs import descriptor_pair
+from bench.geometry.metric_inputs import validate_descriptors
 from bench.types import Floats
 
 
@@ -23,7 +23,7 @@ class L2(Metric):
 
     def __call__(self, truth: Floats, estimate: Floats) -> float:
         # (N, D) each
-        true, estimated = descriptor_pair(truth, estimate)
+        true, estimated = validate_descriptors(truth, estimate)
         return float(np.linalg.norm(true - estimated, axis=1).mean())
 
 

@@ -1,4 +1,4 @@
-"""Learned perceptual distance (Zhang et al., CVPR 2018), where the user has the weights of the network that it rests on."""
+"""Learned perceptual distance (Zhang et al., CVPR 2018), with the user's weights of its network."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from typing import Any, ClassVar, Literal
 
 from bench.api import Metric
 from bench.core.errors import UserError
-from bench.geometry.metric_inputs import Doubles, image_pair
+from bench.geometry.metric_inputs import Doubles, validate_images
 from bench.types import Floats
 
 
 @dataclass(frozen=True, kw_only=True)
 class LPIPS(Metric):
-    """Learned perceptual distance, by its authors' library: that of AlexNet's features, weighted as people judged.
+    """Learned perceptual distance of AlexNet features, weighted by human judgements, from its authors' library.
 
-    `weights` are torchvision's for AlexNet on ImageNet (alexnet-owt-7be5be79.pth). They are no part of this program, and nothing
-    is downloaded; so this metric is told only where it is asked for.
+    `weights` are torchvision's for AlexNet on ImageNet (alexnet-owt-7be5be79.pth). They are not part of this program, and nothing
+    is downloaded. To enable this metric, pass the path of the weights.
     """
 
     compares: ClassVar[Literal["images", "descriptors"]] = "images"
@@ -39,18 +39,18 @@ class LPIPS(Metric):
             raise UserError("lpips: its library is not installed; pip install 'feature-privacy-bench[lpips]'")
         if not self.weights.is_file():
             raise UserError(f"lpips: {self.weights}: no such file; it is torchvision's alexnet-owt-7be5be79.pth")
-        _network(self.weights)
+        _load_network(self.weights)
 
     def __call__(self, truth: Floats, estimate: Floats) -> float:
         import torch
 
         # (H, W, 3) in [0, 1] each
-        images = [_tensor(image) for image in image_pair(truth, estimate)]
+        images = [_to_tensor(image) for image in validate_images(truth, estimate)]
         with torch.no_grad():
-            return float(_network(self.weights)(*images, normalize=True))
+            return float(_load_network(self.weights)(*images, normalize=True))
 
 
-def _tensor(image: Doubles) -> Any:
+def _to_tensor(image: Doubles) -> Any:
     """(H, W, 3) -> (1, 3, H, W) float32"""
     import torch
 
@@ -58,8 +58,8 @@ def _tensor(image: Doubles) -> Any:
 
 
 @functools.lru_cache(maxsize=1)
-def _network(weights: Path) -> Any:
-    """The library's network, with the user's weights in the place of those that it would download.
+def _load_network(weights: Path) -> Any:
+    """Load the library's network with the user's weights instead of downloaded ones.
 
     Raises
     ------
@@ -71,12 +71,12 @@ def _network(weights: Path) -> Any:
 
     settings = LPIPS.parameters
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the library asks torchvision for a network in a way of old
+        warnings.simplefilter("ignore")  # the library calls torchvision by a deprecated interface
         network = lpips.LPIPS(net=settings["network"], version=settings["version"], pnet_rand=True, verbose=False)
     layers = network.net.state_dict()  # slice1.0.weight for features.0.weight
     try:
-        given = torch.load(weights, map_location="cpu", weights_only=True)
-        network.net.load_state_dict({name: given[f"features.{name.partition('.')[2]}"] for name in layers})
+        state = torch.load(weights, map_location="cpu", weights_only=True)
+        network.net.load_state_dict({name: state[f"features.{name.partition('.')[2]}"] for name in layers})
     except (KeyError, RuntimeError, TypeError, pickle.UnpicklingError) as error:
         raise UserError(f"lpips: {weights}: these are not torchvision's weights of AlexNet ({type(error).__name__})") from error
     return network

@@ -8,7 +8,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from bench.api import LocalMetric
-from bench.geometry.metric_inputs import image_pair
+from bench.geometry.metric_inputs import validate_images
 from bench.types import Floats
 
 
@@ -25,7 +25,7 @@ class MAE(LocalMetric):
 
     def local(self, truth: Floats, estimate: Floats) -> Floats:
         # (H, W, 3) in [0, 1] each
-        true, estimated = image_pair(truth, estimate)
+        true, estimated = validate_images(truth, estimate)
         return np.abs(true - estimated).mean(axis=2)
 
 

@@ -1,4 +1,4 @@
-"""Mean squared error of an image; what PSNR is the logarithm of."""
+"""Mean squared error of an image; PSNR is its logarithm."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from bench.api import Metric
-from bench.geometry.metric_inputs import image_pair
+from bench.geometry.metric_inputs import validate_images
 from bench.types import Floats
 
 
@@ -23,7 +23,7 @@ class MSE(Metric):
 
     def __call__(self, truth: Floats, estimate: Floats) -> float:
         # (H, W, 3) in [0, 1] each
-        true, estimated = image_pair(truth, estimate)
+        true, estimated = validate_images(truth, estimate)
         return float(np.square(true - estimated).mean())
 
 

@@ -9,7 +9,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from bench.api import Metric
-from bench.geometry.metric_inputs import image_pair
+from bench.geometry.metric_inputs import validate_images
 from bench.types import Floats
 
 
@@ -24,7 +24,7 @@ class PSNR(Metric):
 
     def __call__(self, truth: Floats, estimate: Floats) -> float | None:
         # (H, W, 3) in [0, 1] each
-        true, estimated = image_pair(truth, estimate)
+        true, estimated = validate_images(truth, estimate)
         mse = float(np.square(true - estimated).mean())
         return None if mse == 0 else -10 * math.log10(mse)
 

@@ -1,4 +1,4 @@
-"""The share of descriptors that an attack recovered."""
+"""The fraction of descriptors that an attack recovers."""
 
 from __future__ import annotations
 
@@ -6,29 +6,29 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 from bench.api import Metric
-from bench.geometry.metric_inputs import descriptor_pair, directions
+from bench.geometry.metric_inputs import normalize_rows, validate_descriptors
 from bench.types import Floats
 
 
 @dataclass(frozen=True, kw_only=True)
 class Recovered(Metric):
-    """Share of keypoints whose true descriptor is, of all in the photograph, the one nearest to the estimate.
+    """Fraction of keypoints whose true descriptor is, of all in the photograph, the one nearest to the estimate.
 
     (1 / N) · |{i : t_i = t_j(i)}| with j(i) = argmax_j cos(t_j, e_i), where t are the true descriptors and e the estimates.
-    The candidates are the N true descriptors of the same photograph; ties go to the lowest index; keypoints of one and the
-    same descriptor count as one candidate. Chance level: 1 / N, for N different descriptors. An attacker who knows nothing
-    of a keypoint does no better, whatever estimate he gives to all.
+    The candidates are the N true descriptors of the same photograph; ties go to the lowest index; equal descriptors count
+    as one candidate. The chance level is 1 / N, for N different descriptors. An attacker without information about a keypoint
+    does no better, for any constant estimate.
     """
 
     compares: ClassVar[Literal["images", "descriptors"]] = "descriptors"
-    unit: ClassVar[str] = "share"
+    unit: ClassVar[str] = "fraction"
     range: ClassVar[tuple[float, float]] = (0.0, 1.0)
     higher_is_better_for: ClassVar[Literal["attacker", "defender"]] = "attacker"
 
     def __call__(self, truth: Floats, estimate: Floats) -> float:
         # (N, D) each
-        true, estimated = descriptor_pair(truth, estimate)
-        nearest = (directions(estimated) @ directions(true).T).argmax(axis=1)  # (N,) j(i)
+        true, estimated = validate_descriptors(truth, estimate)
+        nearest = (normalize_rows(estimated) @ normalize_rows(true).T).argmax(axis=1)  # (N,) j(i)
         return float((true[nearest] == true).all(axis=1).mean())
 
 

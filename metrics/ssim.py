@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import Any, ClassVar, Literal
 
 from bench.api import LocalMetric
-from bench.geometry.metric_inputs import image_pair
+from bench.geometry.metric_inputs import validate_images
 from bench.types import Floats
 
 
@@ -19,7 +19,7 @@ class SSIM(LocalMetric):
     unit: ClassVar[str] = "similarity"
     range: ClassVar[tuple[float, float]] = (-1.0, 1.0)
     higher_is_better_for: ClassVar[Literal["attacker", "defender"]] = "attacker"
-    # SSIM is a family; a number means nothing without these. Both sides of an image must have 11 pixels, the window's width.
+    # SSIM depends on these settings. Both sides of an image must have at least 11 pixels, the window's width.
     parameters: ClassVar[Mapping[str, Any]] = MappingProxyType(
         {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 1.0, "channel_axis": 2}
     )
@@ -28,13 +28,13 @@ class SSIM(LocalMetric):
         from skimage.metrics import structural_similarity
 
         # (H, W, 3) in [0, 1] each
-        true, estimated = image_pair(truth, estimate)
+        true, estimated = validate_images(truth, estimate)
         return float(structural_similarity(true, estimated, **self.parameters))
 
     def local(self, truth: Floats, estimate: Floats) -> Floats:
         from skimage.metrics import structural_similarity
 
-        true, estimated = image_pair(truth, estimate)
+        true, estimated = validate_images(truth, estimate)
         return structural_similarity(true, estimated, full=True, **self.parameters)[1].mean(axis=2)
 
 

@@ -1,1 +1,1 @@
-"""Suites, one file each, which sets `SUITE`; `bench sweep` finds them by their files' names."""
+"""Suites, one file each, which sets `SUITE`; `bench sweep` finds them by file name."""

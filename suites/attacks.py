@@ -1,4 +1,4 @@
-"""Every attack against every defense that it applies to: who is the strongest."""
+"""Every attack against every defense that it applies to: which one is the strongest."""
 
 from bench.registry import discovery, fields
 from bench.runner.suite import Suite, grid
@@ -11,6 +11,6 @@ SUITE = Suite(
     summary="every attack, those of installed packages too, against every defense that it applies to",
     parts=grid(
         defenses=[Undefended(), Affine(), LDP(), LDP(epsilon=16), NaiveLDP()],
-        attacks=[attack() for attack in discovery.everything(discovery.ATTACK) if not fields.without_default(attack)],
+        attacks=[attack() for attack in discovery.load_plugins(discovery.ATTACK) if not fields.list_required(attack)],
     ),
 )

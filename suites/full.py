@@ -1,9 +1,9 @@
-"""Everything: all other suites. What they share is done once."""
+"""All other suites. Shared experiments run once."""
 
 from bench.runner import suite
 from bench.runner.suite import Suite
 
 SUITE = Suite(
     summary="all other suites",
-    parts=tuple(part for name in suite.names() if name != "full" for part in suite.find(name).parts),
+    parts=tuple(part for name in suite.list_suites() if name != "full" for part in suite.find(name).parts),
 )

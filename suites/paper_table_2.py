@@ -1,5 +1,5 @@
-"""The cells of the paper's Table 2, at the sizes of this distribution: those of `bench reproduce table2`."""
+"""The experiments of the paper's Table 2 with the shipped files, as in `bench reproduce table2`."""
 
-from leaderboard.reproduce.suites import of_table
+from leaderboard.reproduce.suites import build_suite
 
-SUITE = of_table("table2")
+SUITE = build_suite("table2")

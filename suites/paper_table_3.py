@@ -1,5 +1,5 @@
-"""The cells of the paper's Table 3, at the sizes of this distribution: those of `bench reproduce table3`."""
+"""The experiments of the paper's Table 3 with the shipped files, as in `bench reproduce table3`."""
 
-from leaderboard.reproduce.suites import of_table
+from leaderboard.reproduce.suites import build_suite
 
-SUITE = of_table("table3")
+SUITE = build_suite("table3")

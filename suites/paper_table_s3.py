@@ -1,5 +1,5 @@
-"""The cells of the paper's Table S3, at the sizes of this distribution: those of `bench reproduce tableS3`."""
+"""The experiments of the paper's Table S3 with the shipped files, as in `bench reproduce tableS3`."""
 
-from leaderboard.reproduce.suites import of_table
+from leaderboard.reproduce.suites import build_suite
 
-SUITE = of_table("tableS3")
+SUITE = build_suite("tableS3")

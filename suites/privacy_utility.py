@@ -1,11 +1,11 @@
-"""What the strongest attacker sees of a query, beside whether the server localizes it: same images, words, ε and m for both."""
+"""Reconstruction and localization of the same queries: same images, words, ε and m for both."""
 
 from attacks.dia import DIA
 from attacks.keypoints import Keypoints
 from attacks.lattice import Lattice
-from bench.api import Asset
 from bench.datasets.gallery import Gallery
 from bench.runner.suite import Suite, grid
+from bench.settings import Asset
 from bench.tasks.localization import Localization
 from bench.tasks.reconstruction import Reconstruction
 from defenses.affine import Affine

@@ -1,4 +1,4 @@
-"""How much each defense's own settings buy, against attackers that know them; over seeds, for how far chance goes."""
+"""Effect of each defense's settings against attackers that know them, over seeds to show the random variation."""
 
 from attacks.context import Context
 from attacks.database import Database

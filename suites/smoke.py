@@ -1,4 +1,4 @@
-"""Seconds: a defense of each kind of release, and the cheapest attackers."""
+"""A run of seconds: one defense per kind of release, and the cheapest attacks."""
 
 from attacks.dia import DIA
 from attacks.keypoints import Keypoints
@@ -10,10 +10,10 @@ from defenses.ldp import LDP
 from defenses.none import Undefended
 
 SUITE = Suite(
-    summary="one photograph, in seconds: whether everything is in its place",
+    summary="one photograph, in seconds: a check of the installation",
     parts=grid(
         defenses=[Undefended(), Affine(), LDP()],
         attacks=[Keypoints(), DIA(), Nearest()],
-        images=[source for source in photographs.builtin() if source.name == "rocket"],  # it has the fewest keypoints
+        images=[source for source in photographs.list_builtin() if source.name == "rocket"],  # it has the fewest keypoints
     ),
 )

@@ -23,22 +23,23 @@ import bench
 from attacks.dia import DIA
 from attacks.keypoints import Keypoints
 from attacks.repeat import Repeat
-from bench.api import Asset, Attack, Between, Dataset, Defense, OneOf
+from bench.api import Attack, Dataset, Defense
 from bench.codebook.public import ASSETS
 from bench.datasets.gallery import Gallery
 from bench.extractors.sift import Sift
-from bench.images.photographs import folder
+from bench.images.photographs import list_photographs
 from bench.images.scene import Scene
 from bench.inversion import weights
 from bench.inversion.plan import Plan, Training
 from bench.inversion.train import train
 from bench.registry import discovery, spec
 from bench.runner.records import Record
+from bench.settings import Asset, Between, OneOf
 from bench.tasks.localization import Localization
 from defenses.none import Undefended
 from defenses.privunit import expected_cosine
 from leaderboard.intervals import Interval, interval, proportion
-from leaderboard.tables import markdown_row
+from bench.core.table import markdown_row
 
 PAGE = Path(__file__).parents[1] / "docs" / "better.md"
 WORDS, SHIFT = 8000, math.log(32)  # 256,000 words over these
@@ -87,7 +88,7 @@ def main() -> None:
     )
     parser.add_argument("--only", choices=("networks", "attacks", "server"), help="do that part, and write nothing")
     args = parser.parse_args()
-    study = Study(args.data, args.work, args.start, args.steps, args.tested, args.queries)
+    study = Study(args.data, args.work, args.initial_checkpoint, args.steps, args.tested, args.queries)
     if args.only in (None, "server"):
         study.served()
     if args.only in (None, "networks", "attacks"):
@@ -128,10 +129,10 @@ class Study:
 
     def __init__(self, data: Path, work: Path, start: Path, steps: int, tested: int, queries: int) -> None:
         folders = part(data, work / "photographs")
-        self.work, self.start, self.steps, self.queries = work, start, steps, queries
+        self.work, self.initial_checkpoint, self.steps, self.queries = work, start, steps, queries
         self.widths = tuple(weights.load(start).meta["shape"]["widths"])
-        self.photographs = folder(folders["2"])[:PHOTOGRAPHS]
-        self.validation = folder(folders["tune"])[:VALIDATION]
+        self.photographs = list_photographs(folders["2"])[:PHOTOGRAPHS]
+        self.validation = list_photographs(folders["tune"])[:VALIDATION]
         self.tested = [data / "train" / name for name in (data / "test.txt").read_text().split()[:tested]]
 
     def network(self, name: str) -> Path:
@@ -145,7 +146,7 @@ class Study:
             photographs=self.photographs,
             validation=self.validation,
             extractor=Sift(),
-            start=self.start,
+            initial_checkpoint=self.initial_checkpoint,
             widths=self.widths,
             training=Training(steps=self.steps, batch=BATCH, rate=RATE, warmup=20),
         )
@@ -206,11 +207,11 @@ def heading(study: Study, networks: Mapping[str, Path], alone: np.ndarray) -> st
     return (
         "# Better defenses at the same ε?\n\n"
         "Written by `tools/compare_defenses.py`, which rebuilds the networks and all numbers here:\n\n"
-        f"```\npython tools/compare_defenses.py --data ../shared/data --work work/better --start {study.start.name} --steps {study.steps} "
+        f"```\npython tools/compare_defenses.py --data ../shared/data --work work/better --start {study.initial_checkpoint.name} --steps {study.steps} "
         f"--tested {len(study.tested)} --queries {study.queries} --networks {' '.join(networks)}\n```\n\n"
         f"|K| is {WORDS:,}: ε = {PAPERS[0] - SHIFT:.3f} tells the true word as often as ε = {PAPERS[0]} with 256,000.\n\n"
         "- **SSIM**: what an attacker sees, of what `dia` paints with a network for that defense. Each network has "
-        f"{widths} channels, started from `{study.start.name}`, which paints raw descriptors, and was trained for {study.steps} "
+        f"{widths} channels, started from `{study.initial_checkpoint.name}`, which paints raw descriptors, and was trained for {study.steps} "
         f"steps of {BATCH} crops of {len(study.photographs)} photographs, all alike. That is little: what they paint is a "
         "floor of what leaks, and differences may grow or vanish with longer training. Each was trained once; how much another "
         f"seed would differ is in no interval. Measured on {len(study.tested)} photographs of `test.txt` and the 7 built-in, "

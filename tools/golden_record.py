@@ -22,15 +22,14 @@ from typing import Any
 
 import numpy as np
 
-from bench.api import Task
 from bench.cache import provenance, store
 from bench.core.errors import SampleError
 from bench.datasets import gallery
 from bench.images import photographs
 from bench.registry import discovery, spec
-from bench.runner import plan as runner
 from bench.runner.plan import RunConfiguration
-from bench.runner.trial import Trials
+from bench.runner.trial import TrialRunner
+from bench.task_api import Task
 from bench.types import Release
 
 TOLERANCE = 1e-6
@@ -70,7 +69,7 @@ class Case:
 
 
 def cases() -> Iterator[Case]:
-    every = tuple(ATTACKS.get(plugin.name(), plugin.name()) for plugin in discovery.everything(discovery.ATTACK))
+    every = tuple(ATTACKS.get(plugin.name(), plugin.name()) for plugin in discovery.load_plugins(discovery.ATTACK))
     yield Case("reconstruction", DEFENSES, every, photographs=("rocket", "coffee"))
     yield Case(
         "reconstruction", ("none", "ldp", "affine"), ("dia", "keypoints"), "sift:upright=false", photographs=("rocket", "coffee")
@@ -96,20 +95,20 @@ def write(file: Any) -> None:
 def measured(case: Case) -> Iterator[dict[str, Any]]:
     """One line for each pair on each sample."""
     plan = planned(case)
-    trials = Trials(plan)
+    trials = TrialRunner(plan)
     for unit in plan.samples[: case.samples]:
         for cell in plan.experiments:
             line: dict[str, Any] = {
                 "case": [case.task, case.extractor, case.dataset],
-                "defense": spec.written(cell.defense),
-                "attack": cell.attack and spec.written(cell.attack),
+                "defense": spec.to_json(cell.defense),
+                "attack": cell.attack and spec.to_json(cell.attack),
                 "sample": unit.name,
             }
             if cell.reason is not None:
                 yield line | {"applies": False}
                 continue
             try:
-                trial = trials.trial(cell, unit)
+                trial = trials.build_trial(cell, unit)
                 outcome = plan.task.evaluate(trial)
             except SampleError as error:
                 yield line | {"applies": True, "failed": type(error).__name__}
@@ -126,11 +125,11 @@ def measured(case: Case) -> Iterator[dict[str, Any]]:
 
 
 def planned(case: Case) -> Any:
-    sources = [source for source in photographs.builtin() if case.photographs is not None and source.name in case.photographs]
+    sources = [source for source in photographs.list_builtin() if case.photographs is not None and source.name in case.photographs]
     task: Task = spec.read(case.task, discovery.TASK)
     attacks = [None if text is None else spec.read(text, discovery.ATTACK) for text in case.attacks]
     pairs = [(spec.read(text, discovery.DEFENSE), attack) for text in case.defenses for attack in attacks]
-    return runner.planned(
+    return build_plan(
         RunConfiguration(
             pairs=tuple(pairs),
             images=sources or None,
@@ -187,9 +186,9 @@ def main() -> int:
     parser.add_argument("what", choices=("write", "check"))
     parser.add_argument("file", type=Path)
     options = parser.parse_args()
-    provenance.source = lambda *modules: "sha256:constant"
-    gallery._renderer = lambda: "constant"
-    with tempfile.TemporaryDirectory() as folder, store.within(Path(folder)):
+    provenance.hash_modules = lambda *modules: "sha256:constant"
+    gallery._hash_renderer = lambda: "constant"
+    with tempfile.TemporaryDirectory() as folder, store.use_folder(Path(folder)):
         if options.what == "write":
             with options.file.open("w") as file:
                 write(file)

@@ -25,20 +25,22 @@ import numpy as np
 import bench
 from attacks.lattice import Lattice
 from attacks.sparsity import Sparsity
-from bench.api import Asset, Attack, Defense, DescriptorAttack, ImageAttack, View
+from bench.api import Attack, Defense, DescriptorAttack, ImageAttack, View
 from bench.codebook import dictionary
 from bench.codebook.public import Public
 from bench.core.progress import Progress
 from bench.extractors.sift import Sift
-from bench.geometry.lattice import unit_integer_points
+from bench.geometry.lattice import find_unit_integer_points
 from bench.images import photographs
 from bench.registry import discovery, spec
-from bench.runner.other_releases import OtherReleases
+from bench.runner.other_releases import ReleasePool
 from bench.runner.records import Record
-from bench.types import Features, Knowledge, Subspaces
+from bench.settings import Asset
+from bench.threat_model import DefenseDatabase, OtherReleases, PublicAssets, PublicDatabase
+from bench.types import Features, Subspaces
 from defenses.affine import Affine
 from leaderboard.intervals import Interval, interval
-from leaderboard.tables import markdown_row
+from bench.core.table import markdown_row
 
 TABLE = Path(__file__).parents[1] / "docs" / "attacks.md"
 TITLE = """# What the attacks recover
@@ -185,7 +187,7 @@ def trial(dim: int, secret: Features, raw: Asset) -> Iterator[np.ndarray]:
             estimates = attack.recover(seen, np.random.default_rng(0))
             yield np.linalg.norm(estimates - secret.descriptors, axis=1) < EXACT
     assert isinstance(seen.release, Subspaces)
-    owners, points = unit_integer_points(seen.release, Lattice.longest)
+    owners, points = find_unit_integer_points(seen.release, Lattice.longest)
     hit = np.linalg.norm(points - secret.descriptors[owners], axis=1) < EXACT
     yield np.isin(np.arange(len(secret)), owners[hit])
 
@@ -196,7 +198,7 @@ def within(hits: np.ndarray, chosen: np.ndarray) -> str:
 
 
 def secrets() -> Iterator[Features]:
-    for source in photographs.builtin():
+    for source in photographs.list_builtin():
         yield Sift().extract(photographs.read(source.path).pixels, source.path)
 
 
@@ -214,7 +216,7 @@ def speed() -> str:
         markdown_row(("attack", *(f"dim {dim}" for dim in DIMS))),
         markdown_row(["---"] * (1 + len(DIMS))),
     ]
-    everybody = list(zip(photographs.builtin(), secrets(), strict=True))[:TIMED_ON]
+    everybody = list(zip(photographs.list_builtin(), secrets(), strict=True))[:TIMED_ON]
     spent: dict[str, list[list[float]]] = {name: [[] for _ in DIMS] for name in TIMED}
     with Progress("speed", len(TIMED) * len(DIMS) * len(everybody)) as progress:
         for column, dim in enumerate(DIMS):
@@ -244,23 +246,23 @@ def seconds(attack: Attack, seen: View) -> float:
 # ---- views
 
 
-def view(defense: Defense, secret: Features, population: OtherReleases | None = None, photograph: str = "") -> View:
+def view(defense: Defense, secret: Features, population: ReleasePool | None = None, photograph: str = "") -> View:
     """All knowledge that there is, whatever an attack asks for."""
     public = PUBLIC
     knowledge = {
-        Knowledge.DATABASE: lambda: public.dictionary(Asset("shipped")),
-        Knowledge.PUBLIC_DATABASE: lambda: public.dictionary(Asset("shipped-public")),
-        Knowledge.TRAINING_IMAGES: lambda: public,
-        Knowledge.OTHER_RELEASES: lambda: population.without(photograph) if population else None,
+        DefenseDatabase: lambda: DefenseDatabase(words=public.dictionary(Asset("shipped")).words),
+        PublicDatabase: lambda: PublicDatabase(words=public.dictionary(Asset("shipped-public")).words),
+        PublicAssets: lambda: PublicAssets(assets=public),
+        OtherReleases: lambda: OtherReleases(draw=population.without(photograph) if population else lambda count: iter(())),
     }
     release = defense.protect(secret, public, np.random.default_rng(0))
     return View(release=release, defense=defense, extractor=Sift(), knowledge=knowledge)
 
 
-def others(defense: Affine) -> OtherReleases:
+def others(defense: Affine) -> ReleasePool:
     """Releases of other photographs, as many as an attack asks for at most, made already."""
-    population = OtherReleases(photographs.builtin(), Sift(), defense, PUBLIC, functools.partial(drawn, defense.dim))
-    for source in photographs.builtin():
+    population = ReleasePool(photographs.list_builtin(), Sift(), defense, PUBLIC, functools.partial(drawn, defense.dim))
+    for source in photographs.list_builtin():
         for _ in population.without(source.name)(800):
             pass
     return population

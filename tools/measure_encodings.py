@@ -23,10 +23,10 @@ from make_assets import part, run
 
 import bench
 from attacks.dia import DIA
-from bench.api import Asset
 from bench.registry import discovery, spec
+from bench.settings import Asset
 from leaderboard.intervals import Interval, interval
-from leaderboard.tables import markdown_row
+from bench.core.table import markdown_row
 
 PAGE = Path(__file__).parents[1] / "docs" / "leakage.md"
 WIDTHS = "32,64,112,112"  # half of the shipped networks': a quarter of the time, so that nine of them can be trained

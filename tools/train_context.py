@@ -13,12 +13,12 @@ from make_assets import part
 
 from bench.codebook.public import ASSETS, Public
 from bench.context.network import Shape
-from bench.context.train import fit, lessons, validate
+from bench.context.train import build_sampler, fit, validate
 from bench.context.weights import save
 from bench.extractors.sift import Sift
-from bench.images.photographs import SIDE, folder
-from bench.images.views import PhotographView, collect
-from bench.inversion.data import fitting_dictionaries, quantisation_error, quantise
+from bench.images.photographs import SIDE, list_photographs
+from bench.images.views import PhotographView, collect_views
+from bench.inversion.data import assign_dictionaries, measure_quantisation_error, quantise
 from bench.inversion.plan import Training
 from bench.inversion.train import check_quantisation
 from bench.inversion.weights import describe
@@ -36,21 +36,21 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=2000, help="of two crops each")
     args = parser.parse_args()
     folders = part(args.data, args.work / "photographs")
-    views, unseen = (collect(folder(folders[name]), Sift())[::2] for name in ("2", "tune"))  # not the mirrored ones
+    views, unseen = (collect_views(list_photographs(folders[name]), Sift())[::2] for name in ("2", "tune"))  # not the mirrored ones
     train(views, [view for view in unseen if len(view.pixels) == SIDE], args.out, Training(steps=args.steps, batch=2))
 
 
 def train(views: list[PhotographView], unseen: list[PhotographView], out: Path, training: Training) -> None:
     defense, shape, public = LDP(), Shape(), Public()
     every = [*views, *unseen]
-    dictionaries = fitting_dictionaries({view.photograph for view in every}, [defense.dictionary], public)
+    dictionaries = assign_dictionaries({view.photograph for view in every}, [defense.dictionary], public)
     public = Public(quantise(every, dictionaries, [0], public))
     errors = {
-        "training": quantisation_error(views, dictionaries, public),
-        "validation": quantisation_error(unseen, dictionaries, public),
+        "training": measure_quantisation_error(views, dictionaries, public),
+        "validation": measure_quantisation_error(unseen, dictionaries, public),
     }
     check_quantisation(**errors)
-    draw = lessons(views, defense, SERVED, "subset_size", public, shape.neighbours, training.batch)
+    draw = build_sampler(views, defense, SERVED, "subset_size", public, shape.neighbours, training.batch)
     module, secrets = fit(shape, draw, training), [view.features for view in unseen]
     meta = {
         **describe(defense, dict(SERVED), Sift(), Public()),

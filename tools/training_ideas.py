@@ -32,21 +32,21 @@ from bench.codebook.public import Public
 from bench.core.errors import UserError
 from bench.core.progress import Progress
 from bench.extractors.sift import Sift
-from bench.images.photographs import folder
-from bench.images.views import PhotographView, collect
+from bench.images.photographs import list_photographs
+from bench.images.views import PhotographView, collect_views
 from bench.inversion import weights
 from bench.inversion.data import Example, Examples
-from bench.inversion.encoding import CELL, Points
+from bench.inversion.encoding import CELL, EncodedRelease
 from bench.inversion.learner import Learner
 from bench.inversion.loss import LUMA, WEIGHT, ssim
 from bench.inversion.network import Inverter, Shape
 from bench.inversion.plan import Training
-from bench.inversion.reconstruct import painted
-from bench.inversion.symmetry import IDENTITY, Symmetry, symmetries
-from bench.inversion.train import scored, to_batch, validate
-from bench.types import Descriptors
+from bench.inversion.reconstruct import reconstruct_image
+from bench.inversion.symmetry import IDENTITY, Symmetry, find_symmetries
+from bench.inversion.train import build_batch, score, validate
+from bench.types import Descriptors, Points
 from defenses.none import Undefended
-from leaderboard.tables import markdown_row
+from bench.core.table import markdown_row
 
 DOCS = Path(__file__).parents[1] / "docs"
 LOG, PAGE = DOCS / "ideas.jsonl", DOCS / "ideas.md"
@@ -63,7 +63,7 @@ INPUTS = 128 + 2  # a raw descriptor, and the place within a cell
 
 
 def loss(
-    painted: Tensor,
+    reconstruction: Tensor,
     photograph: Tensor,
     dissimilarity: float = WEIGHT,
     l1: float = 1.0,
@@ -76,22 +76,22 @@ def loss(
 ) -> Tensor:
     """A weighted sum: 1 - SSIM of luminance, L1, root and logarithm of each image's square error, L1 of four coarser scales, of
     differences between neighbouring pixels, and of what a classifier sees, or VGG. By default it is `bench train`'s."""
-    luma = torch.tensor(LUMA, device=painted.device).view(1, 3, 1, 1)
-    total = dissimilarity * (1 - ssim((painted * luma).sum(dim=1), (photograph * luma).sum(dim=1)))
-    total = total + l1 * (painted - photograph).abs().mean()
+    luma = torch.tensor(LUMA, device=reconstruction.device).view(1, 3, 1, 1)
+    total = dissimilarity * (1 - ssim((reconstruction * luma).sum(dim=1), (photograph * luma).sum(dim=1)))
+    total = total + l1 * (reconstruction - photograph).abs().mean()
     if rmse or psnr:
-        mse = (painted - photograph).square().mean(dim=(1, 2, 3)) + 1e-4
+        mse = (reconstruction - photograph).square().mean(dim=(1, 2, 3)) + 1e-4
         total = total + rmse * mse.sqrt().mean() + psnr * mse.log().mean()
     if gradient:
-        error = painted - photograph
+        error = reconstruction - photograph
         total = total + gradient * sum(error.diff(dim=axis).abs().mean() for axis in (2, 3))
     if coarse:
         for _ in range(4):
-            painted, photograph = nnf.avg_pool2d(painted, 2), nnf.avg_pool2d(photograph, 2)
-            total = total + coarse * (painted - photograph).abs().mean()
+            reconstruction, photograph = nnf.avg_pool2d(reconstruction, 2), nnf.avg_pool2d(photograph, 2)
+            total = total + coarse * (reconstruction - photograph).abs().mean()
     for weight, eye in ((classifier, classifiers), (vgg, vggs)):
         if weight:
-            total = total + weight * unlike(painted, photograph, eye)
+            total = total + weight * unlike(reconstruction, photograph, eye)
     return total
 
 
@@ -105,8 +105,8 @@ class Attentive(Inverter):
         super().__init__(shape)
         self.blocks = nn.ModuleList(Neighbours(shape.hidden) for _ in range(blocks))
 
-    def embedded(self, points: Points) -> Tensor:
-        hidden = super().embedded(points)
+    def embed_points(self, points: EncodedRelease) -> Tensor:
+        hidden = super().embed_points(points)
         near, apart = nearest(points.image, points.places * CELL, Neighbours.count)
         for block in self.blocks:
             hidden = block(hidden, near, apart)
@@ -178,7 +178,7 @@ def zoomed(example: Example, share: float, rng: np.random.Generator) -> Example:
     pixels = np.asarray(cv2.resize(seen, (side, side), interpolation=cv2.INTER_CUBIC), dtype=np.uint8)
     assert isinstance(example.release, Descriptors)
     release = dataclasses.replace(
-        example.release, keypoints=moved[inside], descriptors=example.release.descriptors[inside], frames=None
+        example.release, positions=Points(keypoints=moved[inside]), descriptors=example.release.descriptors[inside], frames=None
     )
     return dataclasses.replace(example, pixels=pixels, release=release)
 
@@ -190,7 +190,7 @@ def relit(example: Example, most: float, rng: np.random.Generator) -> Example:
     return dataclasses.replace(example, pixels=np.round(255 * pixels).astype(np.uint8))
 
 
-def thinned(points: Points, share: float, rng: np.random.Generator) -> Points:
+def thinned(points: EncodedRelease, share: float, rng: np.random.Generator) -> EncodedRelease:
     """Without a share of the keypoints."""
     kept = torch.from_numpy(rng.random(len(points.image)) >= share)
     return dataclasses.replace(points, **{name: getattr(points, name)[kept] for name in ("values", "places", "image")})
@@ -227,8 +227,8 @@ class Idea:
         shape = Shape(**{"inputs": INPUTS} | self.shape)
         return Attentive(shape, self.attention) if self.attention else Inverter(shape)
 
-    def measured(self, painted: Tensor, photograph: Tensor) -> Tensor:
-        return loss(painted, photograph, **self.loss)
+    def measured(self, reconstruction: Tensor, photograph: Tensor) -> Tensor:
+        return loss(reconstruction, photograph, **self.loss)
 
     def drawn(self, examples: Examples, rng: np.random.Generator) -> Example:
         example = examples.draw(rng)
@@ -302,25 +302,25 @@ def main() -> None:
 def tried(idea: Idea, args: argparse.Namespace) -> dict[str, Any]:
     """Train for as long as is given, and score the averaged weights."""
     photographs, tune = (seen(args, which, idea.upright) for which in ("012", "tune"))
-    known = symmetries(Sift(upright=idea.upright))
+    known = find_symmetries(Sift(upright=idea.upright))
     under = known if idea.turned else (IDENTITY,)
     examples = Examples(photographs[: 4 * idea.photographs], Undefended(), {}, {}, Public(), under)
     unseen = Examples(tune, Undefended(), {}, {}, Public())
     torch.manual_seed(0)
     network, training = idea.network(), {"warmup": WARMUP, **idea.training}
-    if args.start:
-        network.load_state_dict(weights.load(args.start).module.state_dict())
+    if args.initial_checkpoint:
+        network.load_state_dict(weights.load(args.initial_checkpoint).module.state_dict())
         training = {"rate": 1e-3, **training}  # as tools/make_assets.py goes on from its start
     learner = Learner(network, Training(**training), idea.measured)
     crops = fit(learner, examples, idea, args.seconds)
-    network = learner.averaged()
+    network = learner.load_average()
     scores = validate(network, unseen, tune[::4], 1, "invariant")
     averaged = shown(network, known, tune[::4])
     parameters = sum(weight.numel() for weight in network.parameters())
     return {
         "upright": idea.upright,
         "seconds": args.seconds,
-        "start": args.start and args.start.stem,
+        "start": args.initial_checkpoint and args.initial_checkpoint.stem,
         "trained_on": idea.photographs,
         "crops": crops,
         "parameters": parameters,
@@ -335,7 +335,7 @@ def fit(learner: Learner[Inverter], examples: Examples, idea: Idea, seconds: flo
     with Progress("training", round(seconds)) as progress:
         while (share := (time.process_time() - started) / seconds) < 1:
             rng = np.random.default_rng([0, learner.step])
-            points, photographs = to_batch([idea.drawn(examples, rng) for _ in range(learner.training.batch)], 1, "invariant")
+            points, photographs = build_batch([idea.drawn(examples, rng) for _ in range(learner.training.batch)], 1, "invariant")
             points = thinned(points, idea.dropped, rng) if idea.dropped else points
             value = float(learner.learn(points, photographs, idea.schedule(share)))
             progress.advance(int(seconds * share) - told, f"loss {value:.4f}, {learner.step} steps")
@@ -348,9 +348,9 @@ def shown(network: nn.Module, known: Sequence[Symmetry], views: Sequence[Photogr
     scores = []
     for view in views:
         raw = view.features
-        release = Descriptors(keypoints=raw.keypoints, size=raw.size, descriptors=raw.descriptors)
-        image = painted(network, release, known, np.empty(0, np.float32), 1, "invariant")
-        scores.append(scored(*(torch.from_numpy(pixels).permute(2, 0, 1) for pixels in (image, view.pixels / np.float32(255)))))
+        release = Descriptors(positions=Points(keypoints=raw.keypoints), size=raw.size, descriptors=raw.descriptors)
+        image = reconstruct_image(network, release, known, np.empty(0, np.float32), 1, "invariant")
+        scores.append(score(*(torch.from_numpy(pixels).permute(2, 0, 1) for pixels in (image, view.pixels / np.float32(255)))))
     _, similarity, psnr = np.mean(scores, axis=0)
     return {"times": len(known), "ssim": float(similarity), "psnr": float(psnr)}
 
@@ -361,7 +361,7 @@ def seen(args: argparse.Namespace, which: str, upright: bool) -> list[Photograph
     if not kept.is_file():
         args.work.mkdir(parents=True, exist_ok=True)
         folders = part(args.data, args.work / "photographs")
-        kept.write_bytes(pickle.dumps(collect(folder(folders[which]), Sift(upright=upright))))
+        kept.write_bytes(pickle.dumps(collect_views(list_photographs(folders[which]), Sift(upright=upright))))
     found: list[PhotographView] = pickle.loads(kept.read_bytes())
     return found
 

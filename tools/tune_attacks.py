@@ -21,25 +21,26 @@ from typing import Any
 
 import numpy as np
 
-from attacks.clustering import Clustering, candidates, chosen
+from attacks.clustering import Clustering, build_candidates, select_candidates
 from attacks.database import Database
-from attacks.intersection import Intersection, described
+from attacks.intersection import Intersection, estimate_descriptors
 from bench.api import DescriptorAttack, View, require_subspaces
 from bench.codebook.public import Public
 from bench.core.errors import UserError
 from bench.core.progress import Progress
 from bench.extractors.sift import Sift
-from bench.geometry.database_reconstruction import rebuilt
+from bench.geometry.database_reconstruction import reconstruct_database
 from bench.geometry.estimates import estimate
-from bench.geometry.intersections import meetings_within
-from bench.geometry.shared_sub_database import Company, company
-from bench.geometry.subspaces import nearest_to_subspaces
+from bench.geometry.intersections import find_intersections_within
+from bench.geometry.shared_sub_database import SharedSubDatabase, find_shared_sub_database
+from bench.geometry.subspaces import find_nearest_to_subspaces
 from bench.images import photographs
 from bench.images.photographs import Source
 from bench.registry import discovery, spec
-from bench.runner.other_releases import OtherReleases
-from bench.tasks.reconstruction import offered
-from bench.types import Floats, Knowledge
+from bench.runner.other_releases import ReleasePool
+from bench.tasks.reconstruction import offer_knowledge
+from bench.threat_model import DefenseDatabase, OtherReleases, PublicDatabase
+from bench.types import Floats
 from metrics.angle import Angle
 from metrics.recovered import Recovered
 
@@ -81,9 +82,9 @@ class Tuning:
 def recover_by_database(seen: View, settings: Sequence[Database]) -> Iterator[Tried]:
     """One search for all: fewer neighbours are the first of many."""
     release, adversarial = require_subspaces(seen)
-    words = seen.know(Knowledge.DATABASE).words
+    words = seen.know(DefenseDatabase).words
     most = max(attack.neighbours for attack in settings)
-    found, distances = nearest_to_subspaces(release, words, adversarial + most)
+    found, distances = find_nearest_to_subspaces(release, words, adversarial + most)
     for attack in settings:
         few = slice(adversarial + attack.neighbours)
         yield estimate(release, words, found[:, few], distances[:, few], adversarial, attack.estimators), np.nan
@@ -92,17 +93,17 @@ def recover_by_database(seen: View, settings: Sequence[Database]) -> Iterator[Tr
 def recover_by_clustering(seen: View, settings: Sequence[Clustering]) -> Iterator[Tried]:
     """One search, one clustering for each |V|, and one company for each c."""
     release, adversarial = require_subspaces(seen)
-    z = seen.know(Knowledge.PUBLIC_DATABASE).words
-    found, distances = nearest_to_subspaces(release, z, max(attack.neighbours for attack in settings))
+    z = seen.know(PublicDatabase).words
+    found, distances = find_nearest_to_subspaces(release, z, max(attack.neighbours for attack in settings))
 
     @functools.cache
     def of(neighbours: int) -> Any:
-        return candidates(release, z, found[:, :neighbours], distances[:, :neighbours], adversarial + 1)
+        return build_candidates(release, z, found[:, :neighbours], distances[:, :neighbours], adversarial + 1)
 
     shared = companies(seen)
     for attack in settings:
         kept = shared(attack.others, attack.coverage)
-        yield chosen(of(attack.neighbours), kept), kept.coverage
+        yield select_candidates(of(attack.neighbours), kept), kept.coverage
 
 
 def recover_by_intersection(seen: View, settings: Sequence[Intersection]) -> Iterator[Tried]:
@@ -112,18 +113,18 @@ def recover_by_intersection(seen: View, settings: Sequence[Intersection]) -> Ite
 
     @functools.cache
     def words(others: int, coverage: float) -> Any:
-        return rebuilt(meetings_within(shared(others, coverage).subspaces))
+        return reconstruct_database(find_intersections_within(shared(others, coverage).subspaces))
 
     for attack in settings:
         asked = attack.others, attack.coverage
-        yield described(release, words(*asked), adversarial, attack.neighbours, attack.estimators), shared(*asked).coverage
+        yield estimate_descriptors(release, words(*asked), adversarial, attack.neighbours, attack.estimators), shared(*asked).coverage
 
 
-def companies(seen: View) -> Callable[[int, float], Company]:
+def companies(seen: View) -> Callable[[int, float], SharedSubDatabase]:
     """From c and the share that is enough to the company of the release, each found once."""
     release, adversarial = require_subspaces(seen)
-    others = seen.know(Knowledge.OTHER_RELEASES)
-    return functools.cache(lambda count, enough: company(release, others(count), adversarial, enough))
+    others = seen.know(OtherReleases).draw
+    return functools.cache(lambda count, enough: find_shared_sub_database(release, others(count), adversarial, enough))
 
 
 TUNINGS = (
@@ -170,7 +171,7 @@ def measure(tuning: Tuning, sources: Sequence[Source]) -> np.ndarray:
     public, extractor = Public(), Sift()
     defenses = [spec.read(point, discovery.DEFENSE) for point in POINTS]
     populations = [
-        OtherReleases(sources, extractor, defense, public, functools.partial(drawn, point))
+        ReleasePool(sources, extractor, defense, public, functools.partial(drawn, point))
         for point, defense in enumerate(defenses)
     ]
     settings = list(tuning.settings.values())
@@ -185,7 +186,7 @@ def measure(tuning: Tuning, sources: Sequence[Source]) -> np.ndarray:
             for point, defense in enumerate(defenses):
                 release = defense.protect(secret, public, np.random.default_rng([number, point]))
                 others = populations[point].without(source.name)
-                known = offered(settings[0], defense, public) | {Knowledge.OTHER_RELEASES: lambda others=others: others}
+                known = offer_knowledge(settings[0], defense, public) | {OtherReleases: lambda others=others: OtherReleases(draw=others)}
                 seen = View(release=release, defense=defense, extractor=extractor, knowledge=known)
                 for setting, (found, coverage) in enumerate(tuning.recover(seen, settings)):
                     values[point, setting, number] = [*(metric(secret.descriptors, found) for metric in METRICS), coverage]

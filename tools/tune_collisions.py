@@ -24,12 +24,12 @@ from bench.codebook.public import Public
 from bench.core.progress import Progress
 from bench.extractors.sift import Sift
 from bench.geometry.nearest_words import unit_rows
-from bench.geometry.shared_sub_database import company, nearest_that_meet
+from bench.geometry.shared_sub_database import compute_intersection_distances, find_shared_sub_database
 from bench.images import photographs
 from bench.images.photographs import Source
-from bench.runner.other_releases import OtherReleases
-from bench.tasks.collisions import no_collision
-from bench.types import Knowledge
+from bench.runner.other_releases import ReleasePool
+from bench.tasks.collisions import is_collision_free
+from bench.threat_model import Knowledge, OtherReleases, PublicDatabase
 from defenses.affine import Affine
 
 DIMS = (2, 4, 8, 16)
@@ -54,7 +54,7 @@ def main() -> None:
             right, nearest = np.concatenate([one[0] for one in found]), np.concatenate([one[1] for one in found])
             success[place] = right.mean()
             for column, tolerance in enumerate(TOLERANCES):
-                without = no_collision(nearest, tolerance)
+                without = is_collision_free(nearest, tolerance)
                 told[place, column] = without[right].mean() - without[~right].mean()
                 clear[place, column] = without.mean()
     write("collisions", report(told, clear, success, args.photographs))
@@ -64,21 +64,21 @@ def measured(dim: int, sources: list[Source], count: int, progress: Progress) ->
     """Of each of the first photographs: where the attack succeeds, (N,), and what `no_collision` is computed from, (N, 1 + a)."""
     public, extractor, defense, attack = Public(), Sift(), Affine(dim=dim), Clustering()
     words = unit_rows(public.dictionary(defense.database).words)
-    population = OtherReleases(sources, extractor, defense, public, partial(drawn, dim))
+    population = ReleasePool(sources, extractor, defense, public, partial(drawn, dim))
     for number, source in enumerate(sources[:count]):
         secret = extractor.extract(photographs.read(source.path).pixels)
-        lifted = defense.lifted(secret, public, np.random.default_rng([SEED, dim, number]))
-        knowledge: dict[Knowledge, Callable[[], Any]] = {
-            Knowledge.PUBLIC_DATABASE: lambda: public.dictionary(attack.database),
-            Knowledge.OTHER_RELEASES: partial(population.without, source.name),
+        lifted = defense.lift(secret, public, np.random.default_rng([SEED, dim, number]))
+        knowledge: dict[type[Knowledge], Callable[[], Any]] = {
+            PublicDatabase: lambda: PublicDatabase(words=public.dictionary(attack.database).words),
+            OtherReleases: lambda: OtherReleases(draw=population.without(source.name)),
         }
         seen = View(release=lifted.release, defense=defense, extractor=extractor, knowledge=knowledge)
         estimate = attack.recover(seen, np.random.default_rng(SEED))
         points = np.concatenate([secret.descriptors[:, None], words[lifted.words]], axis=1)  # (N, 1 + a, D)
         right = (points @ estimate[:, :, None])[:, :, 0].argmax(axis=1) == 0
-        shared = company(lifted.release, seen.know(Knowledge.OTHER_RELEASES)(attack.others), defense.adversarial, attack.coverage)
+        shared = find_shared_sub_database(lifted.release, seen.know(OtherReleases).draw(attack.others), defense.adversarial, attack.coverage)
         progress.advance(note=f"dim {dim}, {shared.summary()}")
-        yield right, nearest_that_meet(points.astype(np.float64), shared)
+        yield right, compute_intersection_distances(points.astype(np.float64), shared)
 
 
 def drawn(dim: int, *parts: object) -> np.random.Generator:

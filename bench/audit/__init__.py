@@ -1,1 +1,1 @@
-"""Audits of ε: what a defense's releases show of it, by trials and by enumeration."""
+"""Audits of a defense's ε, by trials and by enumeration."""

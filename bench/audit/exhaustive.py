@@ -1,10 +1,10 @@
-"""The exact law of what a randomised function returns, by running it once for each course that its random draws can take.
+"""The exact law of a randomised function's result, by one run for each possible sequence of its random draws.
 
-The function is handed a generator that does not draw, but plays one course after another. A draw from more than `SMALL` numbers
-(64 random bits, a double in [0, 1)) is not played number by number: where two numbers lead to one law, all between them are taken
-to do so, and where they do not, bisection finds the border. That is exact for a function which compares such a draw with one
-threshold, as samplers do; numbers at `PROBES` more places tell where that is not so. What lies nearer to a border than
-`NEGLIGIBLE` is left open, and accounted for.
+The function receives a generator that replays given sequences instead of drawing. A draw from more than `SMALL` numbers (64
+random bits, a double in [0, 1)) is not enumerated: where two numbers lead to one law, all between them are assumed to do so;
+otherwise bisection finds the threshold. That is exact for a function that compares such a draw with one threshold, as samplers
+do. `PROBES` further numbers detect other functions. Numbers nearer to a threshold than `NEGLIGIBLE` are left open, and accounted
+for.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Randomised = Callable[[np.random.Generator], Hashable]
 
 @dataclass(frozen=True)
 class Law:
-    """Outcomes with their probabilities. Together with what was left open they make 1."""
+    """Outcomes with their probabilities. They sum to 1 with the probability left open."""
 
     chances: Mapping[Hashable, Fraction]
     left_open: Fraction = Fraction(0)
@@ -41,35 +41,35 @@ OPEN = Law({}, Fraction(1))
 
 
 class NotEnumerableError(UserError):
-    """The function has too many courses, or draws in a way that cannot be played."""
+    """The function has too many sequences of draws, or uses an unsupported kind of draw."""
 
 
-def law(function: Randomised, runs: int = 200_000) -> Law:
-    """The law of `function(rng)`.
+def compute_law(function: Randomised, runs: int = 200_000) -> Law:
+    """Compute the law of `function(rng)`.
 
     Parameters
     ----------
-    function : draws by `rng.integers`, `random`, `permutation` or `choice` (without weights), and by nothing else
-    runs : of it, at most
+    function : draws only by `rng.integers`, `random`, `permutation` or `choice` (without weights)
+    runs : greatest number of calls
 
     Raises
     ------
     NotEnumerableError
-        if they are not enough, or the function draws in another way.
+        if more runs are needed, or the function uses another kind of draw.
     """
-    return _Explorer(function, runs).after(())
+    return _Explorer(function, runs).explore(())
 
 
-def greatest_ratio(laws: Sequence[Law]) -> tuple[Fraction | None, Fraction | None]:
-    """Bounds, from below and above, of the greatest quotient of two laws' probabilities of one outcome. None is infinite."""
+def bound_greatest_ratio(laws: Sequence[Law]) -> tuple[Fraction | None, Fraction | None]:
+    """Return lower and upper bounds of the greatest quotient of two laws' probabilities of one outcome. None is infinite."""
     outcomes = {outcome for each in laws for outcome in each.chances}
     least = [[each.chances.get(outcome, Fraction(0)) for each in laws] for outcome in outcomes]
     most = [[each.at_most(outcome) for each in laws] for outcome in outcomes]
-    return _greatest(least, most), _greatest(most, least)
+    return _find_greatest_quotient(least, most), _find_greatest_quotient(most, least)
 
 
-def _greatest(over: list[list[Fraction]], under: list[list[Fraction]]) -> Fraction | None:
-    """The greatest quotient of one outcome's probabilities; those that are nowhere positive have none."""
+def _find_greatest_quotient(over: list[list[Fraction]], under: list[list[Fraction]]) -> Fraction | None:
+    """Return the greatest quotient of one outcome's probabilities; outcomes of probability zero are skipped."""
     pairs = [(max(top), min(bottom)) for top, bottom in zip(over, under, strict=True) if max(top) > 0]
     return None if any(bottom == 0 for _, bottom in pairs) else max(top / bottom for top, bottom in pairs)
 
@@ -80,49 +80,49 @@ class _Explorer:
     def __init__(self, function: Randomised, runs: int) -> None:
         self._function, self._runs = function, runs
 
-    def after(self, course: tuple[int, ...]) -> Law:
-        """The law once the first draws came out as in `course`."""
+    def explore(self, draws: tuple[int, ...]) -> Law:
+        """Return the law given the first draws."""
         self._runs -= 1
         if self._runs < 0:
-            raise NotEnumerableError("its draws can take too many courses")
+            raise NotEnumerableError("its draws have too many sequences")
         try:
-            return Law({self._function(_Player(course)): Fraction(1)})  # type: ignore[arg-type]
-        except _Unplayed as draw:
-            outcomes = draw.outcomes
+            return Law({self._function(_ReplayGenerator(draws)): Fraction(1)})  # type: ignore[arg-type]
+        except _PendingDraw as pending:
+            outcomes = pending.outcomes
         if outcomes <= SMALL:
-            return _mixture((self.after((*course, k)), Fraction(1, outcomes)) for k in range(outcomes))
-        return self._by_thresholds(course, outcomes)
+            return _mix_laws((self.explore((*draws, k)), Fraction(1, outcomes)) for k in range(outcomes))
+        return self._explore_thresholds(draws, outcomes)
 
-    def _by_thresholds(self, course: tuple[int, ...], outcomes: int) -> Law:
-        """The law where the next draw is from many numbers."""
-        known: dict[int, Law] = {}
+    def _explore_thresholds(self, draws: tuple[int, ...], outcomes: int) -> Law:
+        """Return the law where the next draw is from many numbers."""
+        laws: dict[int, Law] = {}
 
-        def at(k: int) -> Law:
-            if k not in known:
-                known[k] = self.after((*course, k))
-            return known[k]
+        def evaluate(k: int) -> Law:
+            if k not in laws:
+                laws[k] = self.explore((*draws, k))
+            return laws[k]
 
-        def between(low: int, high: int) -> list[tuple[int, int, Law]]:
-            """Ranges that cover low, ..., high − 1, and the law of each."""
-            if high - low == 1 or at(low) == at(high):
-                return [(low, high, at(low))]
+        def split(low: int, high: int) -> list[tuple[int, int, Law]]:
+            """Return ranges that cover low, ..., high − 1, and the law of each."""
+            if high - low == 1 or evaluate(low) == evaluate(high):
+                return [(low, high, evaluate(low))]
             if Fraction(high - low, outcomes) < NEGLIGIBLE:
                 return [(low, high, OPEN)]
-            # Not the very middle, which may be a threshold; a draw that equals one may lead to more draws without end.
+            # Not the exact middle, which may be a threshold: a draw equal to it may lead to endless further draws.
             middle = low + max(1, (high - low) * 13 // 21)
-            return between(low, middle) + between(middle, high)
+            return split(low, middle) + split(middle, high)
 
         edge = int(outcomes * NEGLIGIBLE / 2)
         last = outcomes - 1 - edge
-        ranges = [*between(edge, last), (last, last + 1, at(last)), (0, edge, OPEN), (last + 1, outcomes, OPEN)]
+        ranges = [*split(edge, last), (last, last + 1, evaluate(last)), (0, edge, OPEN), (last + 1, outcomes, OPEN)]
         for probe in np.random.default_rng(0).random(PROBES):
             k = edge + int(probe * (last - edge))
-            if any(low <= k < high and expected not in (at(k), OPEN) for low, high, expected in ranges):
-                raise NotEnumerableError("it does not compare random bits with thresholds alone")
-        return _mixture((each, Fraction(high - low, outcomes)) for low, high, each in ranges)
+            if any(low <= k < high and expected not in (evaluate(k), OPEN) for low, high, expected in ranges):
+                raise NotEnumerableError("it does more than compare random bits with thresholds")
+        return _mix_laws((each, Fraction(high - low, outcomes)) for low, high, each in ranges)
 
 
-def _mixture(parts: Iterable[tuple[Law, Fraction]]) -> Law:
+def _mix_laws(parts: Iterable[tuple[Law, Fraction]]) -> Law:
     chances: dict[Hashable, Fraction] = {}
     left_open = Fraction(0)
     for part, weight in parts:
@@ -132,41 +132,41 @@ def _mixture(parts: Iterable[tuple[Law, Fraction]]) -> Law:
     return Law(chances, left_open)
 
 
-class _Unplayed(BaseException):  # not an Exception, which the function may catch
-    """The course ends at a draw from so many numbers."""
+class _PendingDraw(BaseException):  # not an Exception, which the function may catch
+    """The sequence ends before a draw from `outcomes` numbers."""
 
     def __init__(self, outcomes: int) -> None:
         self.outcomes = outcomes
 
 
-class _Player:
-    """Stands in for a generator, and plays one course."""
+class _ReplayGenerator:
+    """Replaces a generator, and replays one sequence of draws."""
 
-    def __init__(self, course: tuple[int, ...]) -> None:
-        self._course = iter(course)
+    def __init__(self, draws: tuple[int, ...]) -> None:
+        self._draws = iter(draws)
 
     def __getattr__(self, name: str) -> Any:
-        raise NotEnumerableError(f"it draws by rng.{name}, which is not played")
+        raise NotEnumerableError(f"it draws by rng.{name}, which is not supported")
 
     def _number(self, outcomes: int) -> int:
         if outcomes == 1:
             return 0
-        for number in self._course:
+        for number in self._draws:
             return number
-        raise _Unplayed(outcomes)
+        raise _PendingDraw(outcomes)
 
     def _array(self, draw: Callable[[], Any], size: Any, dtype: Any) -> Any:
         if size is None:
             return draw()
         numbers = np.empty(size, dtype=dtype)
-        for place in range(numbers.size):
-            numbers.flat[place] = draw()
+        for i in range(numbers.size):
+            numbers.flat[i] = draw()
         return numbers
 
     def integers(self, low: Any, high: Any = None, size: Any = None, dtype: Any = np.int64, endpoint: bool = False) -> Any:
         if np.ndim(low) or np.ndim(high):
             if size is not None:
-                raise NotEnumerableError("it draws by rng.integers from many ranges in a given shape, which is not played")
+                raise NotEnumerableError("it draws by rng.integers from many ranges in a given shape, which is not supported")
             ranges = np.broadcast(low, low if high is None else high)
             each = [self.integers(0 if high is None else one, other, endpoint=endpoint) for one, other in ranges]
             return np.array(each, dtype=dtype).reshape(ranges.shape)
@@ -181,11 +181,11 @@ class _Player:
 
     def choice(self, a: Any, size: Any = None, replace: bool = True, p: Any = None) -> Any:
         if p is not None:
-            raise NotEnumerableError("it draws by rng.choice with weights, which is not played")
+            raise NotEnumerableError("it draws by rng.choice with weights, which is not supported")
         left = list(range(a)) if np.ndim(a) == 0 else list(a)
 
         def draw() -> Any:
-            place = self._number(len(left))
-            return left[place] if replace else left.pop(place)
+            index = self._number(len(left))
+            return left[index] if replace else left.pop(index)
 
         return self._array(draw, size, np.asarray(a).dtype)

@@ -1,4 +1,4 @@
-"""Counts of events in many calls, and what they show: the event is chosen on one half of the calls and measured on the other."""
+"""Counts of events over many calls; an event is selected on one half of the calls and measured on the other half."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.audit.bounds import log_ratio, more_alike_than_independent
+from bench.audit.bounds import is_overdispersed, log_ratio
 from bench.audit.events import Flags
 
 CONFIDENCE = 0.95  # of bounds
@@ -17,61 +17,66 @@ CERTAINTY = 1 - 1e-6  # of the verdict `violated`, over all families together
 
 @dataclass(frozen=True)
 class Finding:
-    """What one family of events shows."""
+    """Lower bounds of ε from one family of events."""
 
     family: str
     event: str  # in words
-    rates: tuple[float, float]  # given the input under which the event is likelier, and given the other one
+    rates: tuple[float, float]  # under the input with the greater rate, and under the other one
     trials: int  # of each input
-    epsilon: float  # at least, with CONFIDENCE
-    certain: float  # at least, with CERTAINTY
-    expected: float  # the bound on the half of the calls by which the event was chosen
-    alike: bool  # whether answers of one call were too much alike, so that one of each call was counted
+    epsilon: float  # lower bound at CONFIDENCE
+    certain_epsilon: float  # lower bound at CERTAINTY
+    selection_epsilon: float  # lower bound on the half of the calls that selects the event
+    overdispersed: bool  # whether answers of one call vary more than independent ones, so that one of each call is counted
 
-    def per(self, distance: float) -> Finding:
-        """The same, with bounds per unit of the distance that the two inputs are apart."""
-        return replace(self, epsilon=self.epsilon / distance, certain=self.certain / distance, expected=self.expected / distance)
+    def divide_by(self, distance: float) -> Finding:
+        """Return the finding with bounds per unit of distance."""
+        return replace(
+            self,
+            epsilon=self.epsilon / distance,
+            certain_epsilon=self.certain_epsilon / distance,
+            selection_epsilon=self.selection_epsilon / distance,
+        )
 
 
 @dataclass(eq=False)
 class Tally:
     """Counts of one family's events under two inputs, call by call."""
 
-    hits: list[NDArray[np.int32]] = field(default_factory=list)  # of (2, E), over the places of a call
-    first: list[Flags] = field(default_factory=list)  # of (2, E), at the first place alone
+    hits: list[NDArray[np.int32]] = field(default_factory=list)  # of (2, E), over the pairs of a call
+    first: list[Flags] = field(default_factory=list)  # of (2, E), of the first pair only
 
     def add(self, one: Flags, other: Flags) -> None:
-        """Count a call in which events happened, or not, at each place. (P, E), (P, E)"""
+        """Count the events of a call's pairs under the two inputs. (P, E), (P, E)"""
         self.hits.append(np.stack([one.sum(axis=0), other.sum(axis=0)]).astype(np.int32))
         self.first.append(np.stack([one[0], other[0]]))
 
-    def finding(self, family: str, names: Sequence[str], places: int, families: int) -> Finding:
-        """Choose the event, and the input under which it is likelier, and measure it.
+    def measure(self, family: str, names: Sequence[str], pairs: int, families: int) -> Finding:
+        """Select the event and the input of the greater rate, and measure them.
 
         Parameters
         ----------
         names : of the events
-        places : of a call
-        families : that are asked, each of which may be wrong
+        pairs : per call
+        families : number of families, for the correction of CERTAINTY
         """
         hits = np.stack(self.hits)  # (C, 2, E)
         half = len(hits) // 2
-        given, event, expected = _most_telling(hits[:half], half * places)
-        alike = any(more_alike_than_independent(hits[:half, either, event], places) for either in (0, 1))
-        if alike:
-            hits, places = np.stack(self.first).astype(np.int32), 1
-            given, event, expected = _most_telling(hits[:half], half)
-        trials = half * places
+        given, event, selection = _select_event(hits[:half], half * pairs)
+        overdispersed = any(is_overdispersed(hits[:half, either, event], pairs) for either in (0, 1))
+        if overdispersed:
+            hits, pairs = np.stack(self.first).astype(np.int32), 1
+            given, event, selection = _select_event(hits[:half], half)
+        trials = half * pairs
         one, other = (int(hits[half:, either, event].sum()) for either in (given, 1 - given))
         epsilon, certain = (
             max(0.0, float(log_ratio(one, trials, other, trials, confidence)))
             for confidence in (CONFIDENCE, 1 - (1 - CERTAINTY) / families)
         )
-        return Finding(family, names[event], (one / trials, other / trials), trials, epsilon, certain, expected, alike)
+        return Finding(family, names[event], (one / trials, other / trials), trials, epsilon, certain, selection, overdispersed)
 
 
-def _most_telling(hits: NDArray[np.int32], trials: int) -> tuple[int, int, float]:
-    """The input under which, and the event of which, the bound is greatest; and that. hits: (C, 2, E)"""
+def _select_event(hits: NDArray[np.int32], trials: int) -> tuple[int, int, float]:
+    """Return the input and the event with the greatest bound, and the bound. hits: (C, 2, E)"""
     counts = hits.sum(axis=0)  # (2, E)
     bounds = log_ratio(counts, trials, counts[::-1], trials, CONFIDENCE)
     given, event = divmod(int(bounds.argmax()), bounds.shape[1])

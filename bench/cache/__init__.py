@@ -1,1 +1,1 @@
-"""Results that are stored under the hash of what they were computed from."""
+"""Caches on disk. Every result is stored under the hash of its inputs."""

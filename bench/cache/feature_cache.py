@@ -1,6 +1,6 @@
-"""Features of images that are dear to read, and the words that descriptors quantise to, kept by the hash of what made them.
+"""Caches features of images and the nearest words of their descriptors.
 
-Both are the owner's secrets, as the photographs are. Only the runner keeps them, which measures; nothing that protects does.
+Both are secrets of the owner, as the photographs are. Only the benchmark stores them; code that protects photographs does not.
 """
 
 from __future__ import annotations
@@ -28,81 +28,86 @@ from bench.types import Bytes, Features, Floats, Indices
 
 KIND = "features"
 WORDS = "words"
-FEW = 16  # images that are not worth processes of their own
+MAX_SEQUENTIAL = 16  # images; more are extracted in parallel
 
 
-def features(extractor: Extractor, pixels: Pixels) -> Features:
-    """Extract, unless it was done before.
+def extract(extractor: Extractor, pixels: Pixels) -> Features:
+    """Return the features of an image from the cache, or extract them.
 
     Raises
     ------
-    UnitError
+    SampleError
         if the image cannot be read, or has no keypoint.
     """
 
-    def make() -> store.Content:
-        found = extractor.extract(pixels.read(), getattr(pixels, "path", None))
-        return to_arrays(found), {"size": list(found.size)}
+    def compute() -> store.Content:
+        features = extractor.extract(pixels.read(), getattr(pixels, "path", None))
+        return to_arrays(features), {"size": list(features.size)}
 
-    arrays, meta = store.fetch(KIND, _key(extractor, pixels), make)
+    arrays, meta = store.fetch(KIND, _key(extractor, pixels), compute)
     return from_arrays(arrays, tuple(meta["size"]))
 
 
-def all_features(extractor: Extractor, images: Sequence[Pixels]) -> Iterator[Features]:
-    """The features of images; where many are not kept yet, as many processes extract them as this one may use threads.
+def extract_all(extractor: Extractor, images: Sequence[Pixels]) -> Iterator[Features]:
+    """Yield the features of images. If many are missing in the cache, one process per available thread extracts them.
 
     Raises
     ------
-    UnitError
+    SampleError
         if one of them cannot be read.
     """
-    missing = [image for image in images if not store.path(KIND, _key(extractor, image)).is_file()]
+    missing = [image for image in images if not store.entry_path(KIND, _key(extractor, image)).is_file()]
     processes = torch.get_num_threads()
-    if len(missing) > FEW and processes > 1:
-        executor = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), threads.limit, (1,))
+    if len(missing) > MAX_SEQUENTIAL and processes > 1:
+        executor = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), threads.limit_threads, (1,))
         with executor, Progress("features of reference images", len(missing)) as progress:
-            for _ in executor.map(_keep, itertools.repeat(extractor), missing):
+            for _ in executor.map(_extract_to_cache, itertools.repeat(extractor), missing):
                 progress.advance()
-    return (features(extractor, image) for image in images)
+    return (extract(extractor, image) for image in images)
 
 
-def _keep(extractor: Extractor, pixels: Pixels) -> None:
-    """As `features`, for a process that keeps them for others."""
-    features(extractor, pixels)
+def _extract_to_cache(extractor: Extractor, pixels: Pixels) -> None:
+    """Extract in a worker process; the result is read from the cache."""
+    extract(extractor, pixels)
 
 
 def _key(extractor: Extractor, pixels: Pixels) -> dict[str, Any]:
     return {
         "image": pixels.content_hash(),
-        "extractor": spec.written(extractor),
-        "source": provenance.source(type(extractor).__module__),
-        "libraries": environment.libraries(),
+        "extractor": spec.to_json(extractor),
+        "source": provenance.hash_modules(type(extractor).__module__),
+        "libraries": environment.list_library_versions(),
     }
 
 
-def nearest_words(known: Dictionary, rows: Bytes | Floats) -> Indices:
-    """The nearest word of each of (N, D) rows, unless they were found before. -> (N,) int64"""
+def find_nearest_words(words: Dictionary, rows: Bytes | Floats) -> Indices:
+    """Return the nearest word of each of (N, D) rows, from the cache or by search. -> (N,) int64"""
 
-    def make() -> store.Content:
-        return {"words": known.index.nearest(rows)}, {}
+    def compute() -> store.Content:
+        return {"words": words.index.find_nearest(rows)}, {}
 
     content = hashlib.sha256(np.ascontiguousarray(rows).data).hexdigest()
     key = {
-        "dictionary": known.digest,
+        "dictionary": words.digest,
         "rows": [content, str(rows.dtype), list(rows.shape)],
-        "source": provenance.source(dictionary.__name__),
-        "environment": environment.computing(),
+        "source": provenance.hash_modules(dictionary.__name__),
+        "environment": environment.describe_platform(),
     }
-    return store.fetch(WORDS, key, make)[0]["words"]
+    return store.fetch(WORDS, key, compute)[0]["words"]
 
 
-def to_arrays(found: Features) -> Arrays:
-    """The features without what they do not have."""
-    parts = {"keypoints": found.keypoints, "descriptors": found.descriptors, "codes": found.codes, "frames": found.frames}
+def to_arrays(features: Features) -> Arrays:
+    """Return the arrays of features that are not None."""
+    parts = {
+        "keypoints": features.keypoints,
+        "descriptors": features.descriptors,
+        "codes": features.codes,
+        "frames": features.frames,
+    }
     return {name: array for name, array in parts.items() if array is not None}
 
 
 def from_arrays(arrays: Arrays, size: tuple[int, int]) -> Features:
-    """The features that `to_arrays` took apart."""
+    """Invert `to_arrays`."""
     parts: dict[str, np.ndarray | None] = {name: arrays.get(name) for name in ("codes", "frames")}
     return Features(keypoints=arrays["keypoints"], descriptors=arrays["descriptors"], size=size, **parts)

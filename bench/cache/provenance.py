@@ -1,7 +1,6 @@
-"""Digests of source, for keys: of modules and of all that they import of ours, and of nothing else.
+"""Hashes the source of modules and of their imports, for cache keys.
 
-`environment.source_digest`, which records hold, is of everything that there is of ours; by it, a new metric would leave nothing
-to find again.
+Records hold `environment.hash_source`, the hash of all our source. As a key, it would make a new metric invalidate every entry.
 """
 
 from __future__ import annotations
@@ -17,17 +16,17 @@ from bench.core.environment import PACKAGES
 
 
 @functools.cache
-def source(*modules: str) -> str:
-    """SHA-256 over the source of these modules, and of what they import of our packages and of their own."""
+def hash_modules(*modules: str) -> str:
+    """Return the SHA-256 of the source of `modules` and of all that they import from our packages and from their own."""
     ours = {*PACKAGES, *(module.partition(".")[0] for module in modules)}
     texts: dict[str, str] = {}
     waiting = list(modules)
     while waiting:
         module = waiting.pop()
-        if module in texts or module.partition(".")[0] not in ours or (text := _text(module)) is None:
+        if module in texts or module.partition(".")[0] not in ours or (text := _read_source(module)) is None:
             continue
         texts[module] = text
-        waiting += _imported(module, text)
+        waiting += _list_imports(module, text)
     digest = hashlib.sha256()
     for module in sorted(texts):
         digest.update(f"{module} {hashlib.sha256(texts[module].encode()).hexdigest()}\n".encode())
@@ -35,8 +34,8 @@ def source(*modules: str) -> str:
 
 
 @functools.cache
-def _text(module: str) -> str | None:
-    """The source; None if there is no such module, or it has none."""
+def _read_source(module: str) -> str | None:
+    """Return the source, None if the module does not exist or has none."""
     try:
         spec = importlib.util.find_spec(module)
     except (ImportError, ValueError):
@@ -44,8 +43,8 @@ def _text(module: str) -> str | None:
     return spec.loader.get_source(module) if spec and isinstance(spec.loader, InspectLoader) else None
 
 
-def _imported(module: str, text: str) -> Iterator[str]:
-    """The names of modules that may be imported, at the top or later; not those for types alone."""
+def _list_imports(module: str, text: str) -> Iterator[str]:
+    """Yield the names of modules that may be imported at any time, without those under TYPE_CHECKING."""
     package = module if _is_package(module) else module.rpartition(".")[0]
     waiting: list[ast.AST] = [ast.parse(text)]
     while waiting:

@@ -1,7 +1,7 @@
-"""What was made once and can be made again, kept on disk by the hash of what it was made from, never by name.
+"""Stores results on disk under the hash of their inputs, never by name.
 
-A key says everything that the content depends on: configuration, hashes of inputs, and of the source that makes it. What is
-damaged is made again; where nothing can be written, nothing is kept. All of it may be removed at any time.
+A key holds everything that the content depends on: configuration, hashes of inputs, and the hash of the source that computes it.
+Damaged entries are computed again. If the folder is not writable, nothing is stored. All entries may be removed at any time.
 """
 
 from __future__ import annotations
@@ -17,25 +17,29 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from platformdirs import user_cache_path
+
+from bench.core.environment import DISTRIBUTION
 from bench.core.errors import UserError
-from bench.core.hashing import canonical
+from bench.core.hashing import canonical_json
 from bench.formats import tensor_file
 from bench.formats.tensor_file import Arrays
 
-VARIABLE = "FEATURE_PRIVACY_CACHE"  # of the environment: the folder
+VARIABLE = "FEATURE_PRIVACY_CACHE"  # environment variable: the folder of the cache
 SUFFIX = ".safetensors"
-SUMS = "SHA256SUMS"  # of a folder: its files' checksums, as sha256sum writes them
+SUMS = "SHA256SUMS"  # checksums of a folder's files, as sha256sum writes them
 Content = tuple[Arrays, dict[str, Any]]
 
 
-def root() -> Path:
-    """The folder that everything is kept in."""
-    return Path(os.environ.get(VARIABLE, "runs/cache"))
+def cache_folder() -> Path:
+    """Return the folder of the cache: FEATURE_PRIVACY_CACHE if set, else the platform's folder for caches."""
+    folder = os.environ.get(VARIABLE)
+    return Path(folder) if folder else user_cache_path(DISTRIBUTION, appauthor=False)
 
 
 @contextlib.contextmanager
-def within(folder: Path) -> Iterator[None]:
-    """Keep everything there for a while, and find nothing of what is kept elsewhere."""
+def use_folder(folder: Path) -> Iterator[None]:
+    """Use another folder for the cache, inside a `with` statement."""
     before = os.environ.get(VARIABLE)
     os.environ[VARIABLE] = str(folder)
     try:
@@ -47,152 +51,158 @@ def within(folder: Path) -> Iterator[None]:
             os.environ[VARIABLE] = before
 
 
-def fetch(kind: str, key: Any, make: Callable[[], Content], worth: float = 0.0) -> Content:
-    """Arrays and metadata that `make` makes, unless they are kept already.
+def fetch(kind: str, key: Any, compute: Callable[[], Content], min_seconds: float = 0.0) -> Content:
+    """Return arrays and metadata from the cache, or from `compute`.
 
     Parameters
     ----------
-    kind : what it is, in a word
-    key : JSON: all that the content depends on
-    worth : seconds; what took less is not kept
+    kind : name of the kind of content
+    key : JSON: everything that the content depends on
+    min_seconds : faster results are not stored
     """
-    file = path(kind, key)
+    file = entry_path(kind, key)
     if file.is_file():
         try:
             arrays, meta, _ = tensor_file.load(file, kind)
         except UserError as error:
-            _damaged(error)
+            _warn_damaged(error)
         else:
-            _used(file)
+            _touch(file)
             return arrays, meta
-    started = time.perf_counter()
-    arrays, meta = make()
-    if time.perf_counter() - started >= worth:
-        with _as_far_as_possible(file):
+    start = time.perf_counter()
+    arrays, meta = compute()
+    if time.perf_counter() - start >= min_seconds:
+        with _log_write_errors(file):
             tensor_file.save(file, kind, arrays, meta)
     return arrays, meta
 
 
-def copy(kind: str, key: Any, to: Path) -> bool:
-    """Copy the file of arrays that is kept under that key; False if there is none."""
-    file = path(kind, key)
-    if (fault := _fault(file)) is not None:
+def copy_file(kind: str, key: Any, target: Path) -> bool:
+    """Copy the file stored under a key to `target`; return False if there is none."""
+    file = entry_path(kind, key)
+    if (fault := _find_fault(file)) is not None:
         if file.is_file():
-            _damaged(fault)
+            _warn_damaged(fault)
         return False
-    to.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = to.with_name(f"{to.name}.{os.getpid()}.unfinished")
-    shutil.copyfile(file, unfinished)
-    unfinished.replace(to)
-    _used(file)
+    _copy(file, target)
+    _touch(file)
     return True
 
 
-def keep(kind: str, key: Any, file: Path) -> None:
-    """Keep a copy of a file of arrays under that key."""
-    kept = path(kind, key)
-    with _as_far_as_possible(kept):
-        kept.parent.mkdir(parents=True, exist_ok=True)
-        unfinished = kept.with_name(f"{kept.name}.{os.getpid()}.unfinished")
-        shutil.copyfile(file, unfinished)
-        unfinished.replace(kept)
+def store_file(kind: str, key: Any, file: Path) -> None:
+    """Store a copy of a file of arrays under a key."""
+    entry = entry_path(kind, key)
+    with _log_write_errors(entry):
+        _copy(file, entry)
 
 
-def folder(kind: str, key: Any, make: Callable[[Path], None]) -> Path:
-    """A folder that `make` fills, unless it is kept already.
+def fetch_folder(kind: str, key: Any, fill: Callable[[Path], None]) -> Path:
+    """Return a folder from the cache, or let `fill` write its files.
 
     Raises
     ------
     OSError
         if it cannot be written.
     """
-    place = path(kind, key).with_suffix("")
-    if place.is_dir():
-        if (fault := _fault(place)) is None:
-            _used(place)
-            return place
-        _damaged(fault)
-        shutil.rmtree(place)
-    unfinished = place.with_name(f"{place.name}.{os.getpid()}.unfinished")
+    folder = entry_path(kind, key).with_suffix("")
+    if folder.is_dir():
+        if (fault := _find_fault(folder)) is None:
+            _touch(folder)
+            return folder
+        _warn_damaged(fault)
+        shutil.rmtree(folder)
+    unfinished = _unfinished_path(folder)
     unfinished.mkdir(parents=True)
     try:
-        make(unfinished)
+        fill(unfinished)
         (unfinished / SUMS).write_text("".join(f"{_sha256(file)}  {file.name}\n" for file in sorted(unfinished.iterdir())))
-        unfinished.replace(place)
+        unfinished.replace(folder)
     except BaseException:
         shutil.rmtree(unfinished)
         raise
-    return place
+    return folder
 
 
-def path(kind: str, key: Any) -> Path:
-    """Where that is kept."""
-    return root() / kind / f"{hashlib.sha256(canonical(key).encode()).hexdigest()[:32]}{SUFFIX}"
+def entry_path(kind: str, key: Any) -> Path:
+    """Return the path of an entry."""
+    return cache_folder() / kind / f"{hashlib.sha256(canonical_json(key).encode()).hexdigest()[:32]}{SUFFIX}"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Entry:
-    """One thing that is kept: a file, or a folder."""
+    """One entry of the cache: a file or a folder."""
 
     path: Path
     kind: str
     size: int  # bytes
-    used: float  # when it was last made or used; seconds since the epoch
+    used: float  # time of the last use; seconds since the epoch
 
-    def fault(self) -> str | None:
-        """What is wrong with its content, read whole; None if nothing."""
-        return _fault(self.path)
+    def find_fault(self) -> str | None:
+        """Read the whole content and return its fault; None if there is none."""
+        return _find_fault(self.path)
 
     def remove(self) -> None:
-        """Remove it, if it is still there."""
+        """Remove the entry if it still exists."""
         if self.path.is_dir():
             shutil.rmtree(self.path, ignore_errors=True)
         else:
             self.path.unlink(missing_ok=True)
 
 
-def entries() -> Iterator[Entry]:
-    """All that is kept, by kind and name."""
-    for place in sorted(root().glob("*/*")):
+def list_entries() -> Iterator[Entry]:
+    """Yield all entries, sorted by kind and name."""
+    for path in sorted(cache_folder().glob("*/*")):
         with contextlib.suppress(FileNotFoundError):  # another process has removed it since
-            files = [place] if place.is_file() else [file for file in place.rglob("*") if file.is_file()]
+            files = [path] if path.is_file() else [file for file in path.rglob("*") if file.is_file()]
             size = sum(file.stat().st_size for file in files)
-            yield Entry(path=place, kind=place.parent.name, size=size, used=place.stat().st_mtime)
+            yield Entry(path=path, kind=path.parent.name, size=size, used=path.stat().st_mtime)
 
 
-def _fault(place: Path) -> str | None:
-    if place.name.endswith(".unfinished"):
-        return f"{place}: was never finished"
-    if place.is_dir():
-        sums = place / SUMS
-        written = [line.split("  ", 1) for line in sums.read_text().splitlines()] if sums.is_file() else []
-        wrong = [name for digest, name in written if not (place / name).is_file() or _sha256(place / name) != digest]
-        if wrong or not written:
-            return f"{place}: {'the checksum of ' + wrong[0] + ' is not what was written' if wrong else 'has no checksums'}"
+def _find_fault(path: Path) -> str | None:
+    if path.name.endswith(".unfinished"):
+        return f"{path}: was never finished"
+    if path.is_dir():
+        sums = path / SUMS
+        listed = [line.split("  ", 1) for line in sums.read_text().splitlines()] if sums.is_file() else []
+        wrong = [name for digest, name in listed if not (path / name).is_file() or _sha256(path / name) != digest]
+        if wrong or not listed:
+            return f"{path}: {'the checksum of ' + wrong[0] + ' is wrong' if wrong else 'has no checksums'}"
         return None
     try:
-        tensor_file.verify(place)
+        tensor_file.verify(path)
     except UserError as error:
         return str(error)
     return None
 
 
-def _damaged(what: object) -> None:
-    logging.getLogger(__name__).warning("%s; it is made again", what)
+def _copy(source: Path, target: Path) -> None:
+    """Copy a file atomically."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = _unfinished_path(target)
+    shutil.copyfile(source, unfinished)
+    unfinished.replace(target)
 
 
-def _used(place: Path) -> None:
+def _unfinished_path(path: Path) -> Path:
+    return path.with_name(f"{path.name}.{os.getpid()}.unfinished")
+
+
+def _warn_damaged(fault: object) -> None:
+    logging.getLogger(__name__).warning("%s; it is computed again", fault)
+
+
+def _touch(path: Path) -> None:
     with contextlib.suppress(OSError):
-        os.utime(place)
+        os.utime(path)
 
 
 @contextlib.contextmanager
-def _as_far_as_possible(file: Path) -> Iterator[None]:
-    """Writing it may fail: the disk may be full, or not ours."""
+def _log_write_errors(file: Path) -> Iterator[None]:
+    """Log a failed write instead of raising: the disk may be full or read-only."""
     try:
         yield
     except OSError as error:
-        logging.getLogger(__name__).warning("%s: %s; it is not kept", file, error.strerror)
+        logging.getLogger(__name__).warning("%s: %s; it is not stored", file, error.strerror)
 
 
 def _sha256(file: Path) -> str:

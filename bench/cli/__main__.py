@@ -1,4 +1,4 @@
-"""`python -m bench.cli`: the same as `bench`."""
+"""`python -m bench.cli` is the same as `bench`."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""What `bench list` prints: plugins with their fields, and which attack applies to which defense."""
+"""The output of `bench list`: plugins with their fields, and which attack applies to which defense."""
 
 from __future__ import annotations
 
@@ -25,50 +25,50 @@ SECTIONS: dict[str, Kind] = {
 }
 
 
-def listing(what: str | None) -> Iterator[Table | Text]:
-    """The section `what`, or all of them and the matrix of what applies to what.
+def build_listing(section: str | None) -> Iterator[Table | Text]:
+    """Yield one section, or all sections and the matrix of attacks and defenses.
 
     Raises
     ------
     UserError
-        if a plugin is refused.
+        if a plugin violates its contract.
     """
-    for section in [what] if what else SECTIONS:
-        yield Text(f"\n{section}", style="bold")
-        for plugin in discovery.everything(SECTIONS[section]):
-            yield from _entry(plugin)
-    if what in (None, "defenses", "attacks"):
-        yield from _matrix()
+    for name in [section] if section else SECTIONS:
+        yield Text(f"\n{name}", style="bold")
+        for plugin in discovery.load_plugins(SECTIONS[name]):
+            yield from _describe(plugin)
+    if section in (None, "defenses", "attacks"):
+        yield from _build_matrix()
 
 
-def _entry(plugin: type[Plugin]) -> Iterator[Table | Text]:
+def _describe(plugin: type[Plugin]) -> Iterator[Table | Text]:
     yield Text.assemble("  ", (plugin.name(), "bold"), f"  {plugin.description()}")
     if not dataclasses.fields(plugin):  # type: ignore[arg-type]
         return
     table = Table(box=None, show_header=False, padding=(0, 2, 0, 0), pad_edge=False)
-    types = fields.field_types(plugin)
+    types = fields.resolve_types(plugin)
     for field in dataclasses.fields(plugin):  # type: ignore[arg-type]
-        default = "must be given" if field.default is dataclasses.MISSING else f"default {_written(field.default)}"
-        table.add_row("     ", Text(field.name), Text(fields.expected(types[field.name]) or ""), Text(default))
+        default = "required" if field.default is dataclasses.MISSING else f"default {_format(field.default)}"
+        table.add_row("     ", Text(field.name), Text(fields.describe_type(types[field.name]) or ""), Text(default))
     yield table
 
 
-def _written(value: Any) -> str:
+def _format(value: Any) -> str:
     return str(value).lower() if isinstance(value, bool) or value is None else str(value)
 
 
-def _matrix() -> Iterator[Table | Text]:
-    """Which attack applies to which defense, with the defaults of all."""
+def _build_matrix() -> Iterator[Table | Text]:
+    """Yield the table of which attack applies to which defense, all with default fields."""
     public = Public()
     task, extractor = spec.read("reconstruction", discovery.TASK), spec.read("sift", discovery.EXTRACTOR)
-    table = Table(title="which attack applies to which defense (with their defaults)", title_justify="left")
+    table = Table(title="which attack applies to which defense (with default fields)", title_justify="left")
     for column in ("defense", "attack", "applies", "reason"):
         table.add_column(column, overflow="fold")
-    for defense in discovery.everything(discovery.DEFENSE):
-        for attack in discovery.everything(discovery.ATTACK):
+    for defense in discovery.load_plugins(discovery.DEFENSE):
+        for attack in discovery.load_plugins(discovery.ATTACK):
             try:
                 reason = task.explain_not_applicable(spec.build(defense, {}), spec.build(attack, {}), extractor, public)
-            except UserError as error:  # a field must be given, or a file is missing
+            except UserError as error:  # a required field or a file is missing
                 reason = str(error)
             table.add_row(Text(defense.name()), Text(attack.name()), "no" if reason else "yes", Text(reason or ""))
     yield table

@@ -1,4 +1,4 @@
-"""What commands share: exit statuses, how options are read, and how things are printed."""
+"""Exit statuses, parsers of option values, shared options, and output to the terminal."""
 
 from __future__ import annotations
 
@@ -10,29 +10,29 @@ from collections.abc import Iterable
 from bench.core.errors import UserError
 
 DONE, FAILED, MISTAKE, REGRESSION, INTERRUPTED = 0, 1, 2, 3, 130
-BROKEN_PIPE = 141  # as a shell reports a program that SIGPIPE ended
-PIPED_WIDTH = 400  # columns of a table that goes to a file: its cells are not folded, so that they can be searched
+BROKEN_PIPE = 141  # exit status of a program that SIGPIPE ended, as in a shell
+PIPED_WIDTH = 400  # columns of a table in a file: wide, so that cells are not folded and can be searched
 
 
 def require(args: argparse.Namespace, options: Iterable[str], command: str) -> None:
-    """Raise UserError if one of these options was not given."""
+    """Raise UserError if one of these options is missing."""
     for option in options:
         if getattr(args, option) in (None, ""):
-            raise UserError(f"--{option.replace('_', '-')} is missing (bench {command} --help explains)")
+            raise UserError(f"--{option.replace('_', '-')} is missing (see bench {command} --help)")
 
 
-def say(status: int, line: str) -> int:
-    """Print a line on stderr; returns the status."""
+def print_status(status: int, line: str) -> int:
+    """Print a line on stderr and return the status."""
     print(f"bench: {line}", file=sys.stderr, flush=True)
     return status
 
 
 def print_rich(*items: object) -> None:
-    """Print what rich can draw."""
+    """Print objects with rich."""
     from rich.console import Console
 
     console = Console(width=None if sys.stdout.isatty() else PIPED_WIDTH)
-    # Rich itself would answer a closed pipe with exit status 1, which is taken.
+    # Rich itself exits with status 1 on a closed pipe, which has another meaning here.
     with console.capture() as captured:
         for item in items:
             console.print(item)
@@ -40,21 +40,21 @@ def print_rich(*items: object) -> None:
     sys.stdout.write(captured.get().encode(encoding, "backslashreplace").decode(encoding))
 
 
-def whole(text: str) -> int:
-    """Read a whole number."""
+def parse_whole(text: str) -> int:
+    """Parse a whole number."""
     try:
         return int(text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"expected a whole number, not {text!r}") from None
 
 
-def wholes(text: str) -> tuple[int, ...]:
-    """Read whole numbers with commas between them."""
-    return tuple(whole(part) for part in text.split(","))
+def parse_wholes(text: str) -> tuple[int, ...]:
+    """Parse whole numbers separated by commas."""
+    return tuple(parse_whole(part) for part in text.split(","))
 
 
-def number(text: str) -> float:
-    """Read a number, exactly."""
+def parse_number(text: str) -> float:
+    """Parse a decimal or a fraction, exactly."""
     from bench.core.exact import Exact
 
     try:
@@ -63,33 +63,35 @@ def number(text: str) -> float:
         raise argparse.ArgumentTypeError(f"expected a number or a fraction, not {text!r}") from None
 
 
-def add_seed(parser: argparse.ArgumentParser, what: str = "everything random") -> None:
+def add_seed(parser: argparse.ArgumentParser, purpose: str = "all random numbers") -> None:
     """Declare --seed."""
-    parser.add_argument("--seed", type=whole, default=0, metavar="N", help=f"of {what} (default: %(default)s)")
+    parser.add_argument("--seed", type=parse_whole, default=0, metavar="N", help=f"seed of {purpose} (default: %(default)s)")
 
 
-def add_extractor(parser: argparse.ArgumentParser, default: str | None = "sift", told: str = "sift") -> None:
-    """Declare --extractor; `told` names the default for people."""
-    parser.add_argument("--extractor", metavar="SPEC", default=default, help=f"what makes the features (default: {told})")
+def add_extractor(parser: argparse.ArgumentParser, default: str | None = "sift", shown: str = "sift") -> None:
+    """Declare --extractor; `shown` is the default in the help text."""
+    parser.add_argument("--extractor", metavar="SPEC", default=default, help=f"extractor of the features (default: {shown})")
 
 
 def add_engine(parser: argparse.ArgumentParser) -> None:
     """Declare --workers, --engine and --scheduler."""
-    parser.add_argument("--workers", type=whole, default=1, metavar="N", help="processes of this machine (default: %(default)s)")
+    parser.add_argument("--workers", type=parse_whole, default=1, metavar="N", help="worker processes (default: %(default)s)")
     parser.add_argument("--engine", metavar="NAME", default="processes", help="processes or dask (default: %(default)s)")
-    parser.add_argument("--scheduler", metavar="ADDRESS", help="of dask, such as tcp://127.0.0.1:8786 (docs/sweeps.md)")
+    parser.add_argument(
+        "--scheduler", metavar="ADDRESS", help="address of dask's scheduler, such as tcp://127.0.0.1:8786 (docs/sweeps.md)"
+    )
 
 
-def size(text: str) -> int:
-    """Read a number of bytes: `500`, `20kB`, `1.5GB`."""
-    found = re.fullmatch(r"([0-9.]+)\s*([kMGT]?)B?", text.strip())
+def parse_size(text: str) -> int:
+    """Parse a number of bytes: `500`, `20kB`, `1.5GB`."""
+    match = re.fullmatch(r"([0-9.]+)\s*([kMGT]?)B?", text.strip())
     try:
-        return round(float(found[1]) * 1000 ** " kMGT".index(found[2] or " ")) if found else int(text)
+        return round(float(match[1]) * 1000 ** " kMGT".index(match[2] or " ")) if match else int(text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"expected a size such as 20MB, not {text!r}") from None
 
 
-def told_size(count: int) -> str:
-    """A number of bytes for people."""
+def format_size(count: int) -> str:
+    """Format a number of bytes."""
     power = min(3, max(0, (len(str(count)) - 1) // 3))
     return f"{count / 1000**power:.3g} {('B', 'kB', 'MB', 'GB')[power]}"

@@ -1,4 +1,4 @@
-"""Watches a run on the terminal: progress, notes and failures as they come."""
+"""Shows a run on the terminal: progress, notes and failures."""
 
 from __future__ import annotations
 
@@ -8,31 +8,32 @@ from pathlib import Path
 
 from bench.cli.terminal import print_rich
 from bench.core.progress import Progress
-from bench.runner import plan
-from bench.runner.engines import Engine
+from bench.runner.engines.base import Engine
+from bench.runner.execute import execute, sort_records
 from bench.runner.plan import Plan
 from bench.runner.records import Record
 
 
 def execute_with_progress(plans: Sequence[Plan], out: Path, engine: Engine, title: str) -> list[Record]:
-    """`runner.execute`, shown. Returns the records in the order of the plans."""
+    """Execute plans with a progress bar. Returns the records in the order of the plans."""
     records: list[Record] = []
-    noted: set[str] = set()
+    shown_notes: set[str] = set()
     with Progress(title, sum(map(len, plans))) as progress:
-        for record in plan.execute(plans, out, engine):
+        for record in execute(plans, out, engine):
             records.append(record)
-            progress.advance(note=record["unit"])
+            progress.advance(note=record["sample"])
             for note in record["notes"]:
-                if note not in noted:
-                    progress.say(f"bench: {note}")
-            noted.update(record["notes"])
+                if note not in shown_notes:
+                    progress.log(f"bench: {note}")
+            shown_notes.update(record["notes"])
             if record["status"] == "failed":
-                progress.say(f"bench: failed: {record['unit']}, {record['defense']['name']}: {record['reason']}")
-    return plan.sort_records(plans, records)
+                progress.log(f"bench: failed: {record['sample']}, {record['defense']['name']}: {record['reason']}")
+    return sort_records(plans, records)
 
 
 def print_tables(records: Sequence[Record]) -> None:
-    """Print what the records come to."""
-    from leaderboard import tables
+    """Print the tables of records."""
+    from bench.core.table import to_terminal
+    from leaderboard.tables import build_tables
 
-    print_rich(*(tables.to_rich(table, foldable=sys.stdout.isatty()) for table in tables.tables(records)))
+    print_rich(*map(to_terminal, build_tables(records, brief=True, foldable=sys.stdout.isatty())))

@@ -1,8 +1,8 @@
 """Builds a dictionary by spherical k-means in two levels.
 
-The descriptors are those of every view of each photograph (`views.py`). About sqrt(K) coarse cells are clustered first; each
-then gets words in proportion to its descriptors, and is clustered on its own. An iteration so costs about 4·n·sqrt(K)·D
-operations where brute force takes 2·n·K·D. Centroids are rounded to 8 bits at SIFT's norm of 512.
+The descriptors are those of every view of each photograph (`bench.images.views`). About sqrt(K) coarse clusters are built
+first. Each then gets words in proportion to its descriptors and is clustered separately. An iteration costs about
+4·n·sqrt(K)·D operations; brute force takes 2·n·K·D. Centroids are rounded to 8 bits at SIFT's norm of 512.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from bench.codebook.dictionary import Dictionary
 from bench.core.errors import UserError
 from bench.core.progress import Progress
 from bench.geometry.nearest_words import WordIndex, unit_rows
-from bench.images.photographs import folder
-from bench.images.views import collect
+from bench.images.photographs import list_photographs
+from bench.images.views import collect_views
 from bench.registry import spec
 from bench.types import Bytes, Floats
 
 ITERATIONS = 12
 NORM = 512.0  # of SIFT's 8-bit vectors
-SAMPLE = 20_000  # descriptors that the reported mean cosine is taken over
+SAMPLE = 20_000  # descriptors for the reported mean cosine
 
 
 def build(images: Path, size: int, out: Path, extractor: Extractor, seed: int) -> Dictionary:
@@ -33,24 +33,24 @@ def build(images: Path, size: int, out: Path, extractor: Extractor, seed: int) -
     Raises
     ------
     UserError
-        if there are fewer descriptors than words, or `out` is there already.
+        if there are fewer descriptors than words, or `out` exists.
     """
     if out.exists():
-        raise UserError(f"{out} is there already; remove it, or name another --out")
+        raise UserError(f"{out} exists already; remove it, or give another --out")
     if size < 2:
         raise UserError(f"--size {size}: a dictionary needs at least 2 words")
-    seen = collect(folder(images), extractor)
-    if any(view.features.codes is None for view in seen):
-        raise UserError(f"{extractor.name()} gives no 8-bit descriptors, which a dictionary's words are made of")
-    codes = np.concatenate([view.features.codes for view in seen if view.features.codes is not None])
+    views = collect_views(list_photographs(images), extractor)
+    if any(view.features.codes is None for view in views):
+        raise UserError(f"{extractor.name()} gives no 8-bit descriptors, which a dictionary needs")
+    codes = np.concatenate([view.features.codes for view in views if view.features.codes is not None])
     if len(codes) < size:
-        raise UserError(f"--size {size}: only {len(codes)} descriptors in {images}; ask for fewer words or give more photographs")
+        raise UserError(f"--size {size}: only {len(codes)} descriptors in {images}; use fewer words or more photographs")
     rng = np.random.default_rng(seed)
     words = cluster(codes, size, rng)
     sample = codes[rng.choice(len(codes), min(SAMPLE, len(codes)), replace=False)]
     meta = {
-        "extractor": spec.written(extractor),
-        "photographs": sorted({view.photograph for view in seen}),
+        "extractor": spec.to_json(extractor),
+        "photographs": sorted({view.photograph for view in views}),
         "descriptors": len(codes),
         "mean_cosine": mean_cosine(sample, words),
         "seed": seed,
@@ -59,30 +59,30 @@ def build(images: Path, size: int, out: Path, extractor: Extractor, seed: int) -
 
 
 def mean_cosine(codes: Bytes, words: Bytes) -> float:
-    """Mean cosine between descriptors and their nearest words. (N, D), (K, D) uint8"""
-    nearest = WordIndex(words).nearest(codes)
+    """Return the mean cosine between descriptors and their nearest words. (N, D), (K, D) uint8"""
+    nearest = WordIndex(words).find_nearest(codes)
     return float((unit_rows(codes) * unit_rows(words[nearest])).sum(axis=1).mean())
 
 
 def cluster(codes: Bytes, size: int, rng: np.random.Generator) -> Bytes:
-    """Spherical k-means in two levels. (n, D) uint8 -> (size, D) uint8 distinct words in random order"""
+    """Cluster by spherical k-means in two levels. (n, D) uint8 -> (size, D) uint8 distinct words in random order"""
     rows = unit_rows(codes)
     coarse = max(1, round(size**0.5))
-    cells = _assign(rows, _kmeans(rows, coarse, rng))
-    order = np.argsort(cells, kind="stable")
-    members = np.split(order, np.cumsum(np.bincount(cells, minlength=coarse))[:-1])
-    shares = _apportion(np.array([len(rows_of_cell) for rows_of_cell in members]), size)
+    clusters = _assign(rows, _run_kmeans(rows, coarse, rng))
+    order = np.argsort(clusters, kind="stable")
+    members = np.split(order, np.cumsum(np.bincount(clusters, minlength=coarse))[:-1])
+    word_counts = _apportion(np.array([len(cluster_rows) for cluster_rows in members]), size)
     centres = []
     with Progress("clustering", size) as progress:
-        for rows_of_cell, share in zip(members, shares, strict=True):
-            if share:
-                centres.append(_kmeans(rows[rows_of_cell], int(share), rng))
-            progress.advance(int(share))
+        for cluster_rows, count in zip(members, word_counts, strict=True):
+            if count:
+                centres.append(_run_kmeans(rows[cluster_rows], int(count), rng))
+            progress.advance(int(count))
     words = np.clip(np.rint(np.concatenate(centres) * NORM), 0, 255).astype(np.uint8)
-    return rng.permutation(_distinct(words, codes, rng))
+    return rng.permutation(_make_distinct(words, codes, rng))
 
 
-def _kmeans(rows: Floats, k: int, rng: np.random.Generator) -> Floats:
+def _run_kmeans(rows: Floats, k: int, rng: np.random.Generator) -> Floats:
     """(n, D) unit rows -> (k, D) unit centres"""
     import faiss
 
@@ -102,28 +102,28 @@ def _kmeans(rows: Floats, k: int, rng: np.random.Generator) -> Floats:
 
 
 def _assign(rows: Floats, centres: Floats) -> np.ndarray:
-    """The centre of greatest cosine of each row; (n, D), (k, D) -> (n,)"""
+    """Return the centre of greatest cosine of each row. (n, D), (k, D) -> (n,)"""
     step = 65_536  # rows at a time, to bound the memory for scores
     return np.concatenate([(rows[start : start + step] @ centres.T).argmax(axis=1) for start in range(0, len(rows), step)])
 
 
 def _apportion(counts: np.ndarray, size: int) -> np.ndarray:
-    """Split `size` words in proportion to `counts` by largest remainders, no cell getting more words than descriptors."""
+    """Split `size` words in proportion to `counts` by largest remainders. No cluster gets more words than descriptors."""
     exact = counts * (size / counts.sum())
-    shares = np.floor(exact).astype(np.int64)
-    missing = size - shares.sum()
-    shares[np.argsort(shares - exact, kind="stable")[:missing]] += 1
-    return np.minimum(shares, counts)
+    word_counts = np.floor(exact).astype(np.int64)
+    missing = size - word_counts.sum()
+    word_counts[np.argsort(word_counts - exact, kind="stable")[:missing]] += 1
+    return np.minimum(word_counts, counts)
 
 
-def _distinct(words: Bytes, codes: Bytes, rng: np.random.Generator) -> Bytes:
-    """Replace words that are zero or stand twice after rounding by descriptors that are not words yet."""
-    wanted = len(words)
-    kept = np.unique(words[words.any(axis=1)], axis=0)
-    while len(kept) < wanted:
-        spare = codes[rng.choice(len(codes), min(len(codes), 4 * (wanted - len(kept))), replace=False)]
-        grown = np.unique(np.concatenate([kept, spare]), axis=0)
-        if len(grown) == len(kept) and len(np.unique(codes, axis=0)) + len(kept) < wanted:
-            raise UserError(f"--size {wanted}: there are not so many distinct descriptors; ask for fewer words")
-        kept = grown
-    return kept[rng.choice(len(kept), wanted, replace=False)] if len(kept) > wanted else kept
+def _make_distinct(words: Bytes, codes: Bytes, rng: np.random.Generator) -> Bytes:
+    """Replace words that are zero or duplicates after rounding by descriptors that are not words yet."""
+    size = len(words)
+    distinct = np.unique(words[words.any(axis=1)], axis=0)
+    while len(distinct) < size:
+        candidates = codes[rng.choice(len(codes), min(len(codes), 4 * (size - len(distinct))), replace=False)]
+        grown = np.unique(np.concatenate([distinct, candidates]), axis=0)
+        if len(grown) == len(distinct) and len(np.unique(codes, axis=0)) + len(distinct) < size:
+            raise UserError(f"--size {size}: there are fewer distinct descriptors than that; use fewer words or more photographs")
+        distinct = grown
+    return distinct[rng.choice(len(distinct), size, replace=False)] if len(distinct) > size else distinct

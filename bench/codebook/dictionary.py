@@ -1,7 +1,7 @@
 """Dictionaries of descriptors: the K of LDP-Feat, the W of affine lifting, the attacker's Z.
 
-Rows are in random order, fixed when the dictionary is built. Sub-database s of n, as affine lifting uses them, is the s-th of
-n runs of rows that are equally long to within one: rows floor(s K / n) up to floor((s + 1) K / n).
+Rows are in random order, fixed when the dictionary is built. Affine lifting splits them into n sub-databases of equal length
+(to within one): sub-database s holds rows floor(s K / n) up to floor((s + 1) K / n).
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ KIND = "dictionary"
 
 @dataclass(frozen=True, eq=False)
 class Dictionary:
-    """K distinct words, the photographs they were made from, and how."""
+    """K distinct words and the metadata of their construction."""
 
-    words: Bytes  # (K, D), no row zero, no row twice
+    words: Bytes  # (K, D), no zero row, no duplicates
     meta: dict[str, Any]  # extractor, photographs (hashes), mean_cosine, seed, ...
     digest: str
 
@@ -36,38 +36,38 @@ class Dictionary:
 
     @property
     def photographs(self) -> frozenset[str]:
-        """Content hashes of the photographs that the words were made from."""
+        """Content hashes of the photographs that the words were built from."""
         return frozenset(self.meta["photographs"])
 
     @cached_property
     def index(self) -> WordIndex:
-        """Finds the nearest words of descriptors."""
+        """The index that finds the nearest words of descriptors."""
         return WordIndex(self.words)
 
     @cached_property
     def neighbours(self) -> Neighbours:
-        """Finds words that are near to words."""
+        """The index that finds words near to words."""
         return Neighbours(self.words)
 
     @cached_property
     def mean(self) -> NDArray[np.float64]:
         """The direction of the mean of the unit words. -> (D,)"""
         lengths = np.linalg.norm(self.words.astype(np.float32), axis=1).astype(np.float64)
-        total = (1 / lengths) @ self.words  # 8-bit numbers weighed in float64
+        total = (1 / lengths) @ self.words  # 8-bit numbers, weighted in float64
         return total / np.linalg.norm(total)
 
     def first(self, count: int) -> Dictionary:
-        """The dictionary of the first `count` words, or of all: rows are in random order, so that they are as good as any."""
+        """Return the dictionary of the first `count` words, or of all. Rows are in random order, so any subset is as good."""
         if count >= len(self):
             return self
         return Dictionary(self.words[:count], self.meta, f"{self.digest}, first {count}")
 
     def sub_database(self, index: int, count: int) -> Bytes:
-        """The rows of sub-database `index` of `count`, by the rule at the top of this file."""
+        """Return the rows of sub-database `index` of `count` (rule: top of this file)."""
         return self.words[self.start(index, count) : self.start(index + 1, count)]
 
     def start(self, index: int, count: int) -> int:
-        """The first row of sub-database `index` of `count`."""
+        """Return the first row of sub-database `index` of `count`."""
         return index * len(self.words) // count
 
 

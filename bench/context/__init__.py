@@ -1,1 +1,1 @@
-"""Weighs the words of a set by the sets around it: what the attack `context` runs, and how it is trained."""
+"""The context model: weighs the words of a set by the sets of nearby keypoints. Used by the attack `context`."""

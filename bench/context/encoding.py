@@ -1,4 +1,4 @@
-"""A release as the network sees it: candidates, their prior odds, and who is near whom."""
+"""Encodes releases as graphs: candidates, their prior odds, and the neighbours of each keypoint."""
 
 from __future__ import annotations
 
@@ -10,62 +10,65 @@ import torch
 
 from bench.api import Defense
 from bench.codebook.public import Public
-from bench.context.network import Scene
+from bench.context.network import KeypointGraph
 from bench.types import Floats, Indices, WordSets
 
-CERTAIN = 20.0  # the log odds at most, either way
+MAX_LOG_ODDS = 20.0  # limit of the log odds in both directions
 
 
 def log_odds(log10_true: float, size: int) -> float:
-    """Log of the chance that a candidate is the true word over that of none being it. `log10_true` is that one of m is."""
-    told = log10_true * math.log(10)
-    if told == 0:
-        return CERTAIN
-    return min(CERTAIN, max(-CERTAIN, told - math.log(size) - math.log(-math.expm1(told))))
+    """Return the log odds of a candidate to be the true word, over none of the candidates to be it.
+
+    `log10_true` is the log chance that the true word is among the candidates.
+    """
+    log_true = log10_true * math.log(10)
+    if log_true == 0:
+        return MAX_LOG_ODDS
+    return min(MAX_LOG_ODDS, max(-MAX_LOG_ODDS, log_true - math.log(size) - math.log(-math.expm1(log_true))))
 
 
 def prior_odds(defense: Defense, public: Public, size: int) -> float:
-    """The same of a defense's release, from its configuration.
+    """Return the log odds of a defense's candidates, from its configuration.
 
     Raises
     ------
     TypeError
-        if the defense does not say how likely the true word is released.
+        if the defense does not declare the chance of the true word.
     """
-    told = defense.privacy(public).log10_true
-    if told is None:
-        raise TypeError(f"{defense.name()} does not say how likely the true word is released")
-    return log_odds(told, size)
+    log10_true = defense.privacy(public).log10_true
+    if log10_true is None:
+        raise TypeError(f"{defense.name()} does not declare the chance of the true word")
+    return log_odds(log10_true, size)
 
 
-def scene(releases: Sequence[WordSets], odds: Sequence[float], neighbours: int) -> Scene:
-    """Lay releases that have equally many candidates a keypoint side by side; none sees another's keypoints."""
-    around, offsets, present, places = [], [], [], []
+def build_graph(releases: Sequence[WordSets], odds: Sequence[float], neighbours: int) -> KeypointGraph:
+    """Join releases with equally many candidates per keypoint into one graph, without edges between releases."""
+    neighbour_indices, offsets, present, positions = [], [], [], []
     start = 0
     for release in releases:
-        near, there = nearest_keypoints(release.keypoints, neighbours)  # (N, k) twice
-        around.append(near + start)
-        present.append(there)
-        offsets.append(release.keypoints[near] - release.keypoints[:, None])
-        places.append(2 * release.keypoints / np.array(release.size, dtype=np.float32) - 1)
+        nearest, exists = find_nearest_keypoints(release.keypoints, neighbours)  # (N, k) twice
+        neighbour_indices.append(nearest + start)
+        present.append(exists)
+        offsets.append(release.keypoints[nearest] - release.keypoints[:, None])
+        positions.append(2 * release.keypoints / np.array(release.size, dtype=np.float32) - 1)
         start += len(release)
-    return Scene(
+    return KeypointGraph(
         candidates=torch.from_numpy(np.concatenate([release.candidates for release in releases])),
         odds=torch.from_numpy(np.repeat(np.array(odds, dtype=np.float32), [len(release) for release in releases])),
-        places=torch.from_numpy(np.concatenate(places).astype(np.float32)),
-        around=torch.from_numpy(np.concatenate(around)),
+        positions=torch.from_numpy(np.concatenate(positions).astype(np.float32)),
+        neighbours=torch.from_numpy(np.concatenate(neighbour_indices)),
         offsets=torch.from_numpy(np.concatenate(offsets)),
         present=torch.from_numpy(np.concatenate(present)),
     )
 
 
-def nearest_keypoints(keypoints: Floats, neighbours: int) -> tuple[Indices, Floats]:
-    """The nearest other keypoints of each, and 0 where there is none left, else 1. (N, 2) -> (N, k), (N, k) float32"""
+def find_nearest_keypoints(keypoints: Floats, neighbours: int) -> tuple[Indices, Floats]:
+    """Return the nearest other keypoints of each, and 1 where there is one, else 0. (N, 2) -> (N, k), (N, k) float32"""
     from sklearn.neighbors import NearestNeighbors
 
     count = len(keypoints)
-    found = min(neighbours, count - 1)
-    near = np.zeros((count, neighbours), dtype=np.int64)
-    if found > 0:
-        near[:, :found] = NearestNeighbors(n_neighbors=found).fit(keypoints).kneighbors(return_distance=False)
-    return near, np.repeat((np.arange(neighbours) < found)[None], count, axis=0).astype(np.float32)
+    available = min(neighbours, count - 1)
+    nearest = np.zeros((count, neighbours), dtype=np.int64)
+    if available > 0:
+        nearest[:, :available] = NearestNeighbors(n_neighbors=available).fit(keypoints).kneighbors(return_distance=False)
+    return nearest, np.repeat((np.arange(neighbours) < available)[None], count, axis=0).astype(np.float32)

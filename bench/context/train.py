@@ -1,4 +1,4 @@
-"""Trains the network that weighs words by their surroundings: which words occur near which in public photographs.
+"""Trains the context model: which words occur near which in public photographs.
 
 The loss is the cross-entropy of the true word among the candidates and "none of them", plus one minus the cosine between the
 posterior mean and the true descriptor.
@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,93 +17,94 @@ import torch
 import torch.nn.functional as nnf
 from torch import Tensor
 
-from bench.api import Between, Defense, OneOf
+from bench.api import Defense
 from bench.codebook.public import Public
-from bench.context.encoding import prior_odds, scene
-from bench.context.network import Belief, Scene, Shape, Surroundings
+from bench.context.encoding import build_graph, prior_odds
+from bench.context.network import Belief, ContextModel, KeypointGraph, Shape
 from bench.core.device import pick_device
 from bench.core.progress import Progress
 from bench.images.views import PhotographView
-from bench.inversion.data import random_crop
+from bench.inversion.data import SupportedSettings, draw_crop
 from bench.inversion.plan import Training
 from bench.types import Features, Indices, WordSets
 
-Served = Mapping[str, Between | OneOf]
-
 
 @dataclass(frozen=True, eq=False)
-class Lesson:
-    """A scene and its secret."""
+class Example:
+    """A graph and its labels."""
 
-    scene: Scene
-    told: Tensor  # (P,) int64, which candidate is the true word; m where none is
-    truth: Tensor  # (P, D) the descriptors
+    graph: KeypointGraph
+    labels: Tensor  # (P,) int64, index of the true word among the candidates; m if it is none
+    descriptors: Tensor  # (P, D)
 
-    def to(self, device: torch.device) -> Lesson:
-        return Lesson(self.scene.to(device), self.told.to(device), self.truth.to(device))
+    def to(self, device: torch.device) -> Example:
+        return Example(self.graph.to(device), self.labels.to(device), self.descriptors.to(device))
 
 
-def lesson(
+def build_example(
     secrets: Sequence[Features], defenses: Sequence[Defense], public: Public, neighbours: int, rng: np.random.Generator
-) -> Lesson:
-    """Release each secret by its defense, all of which release equally many words."""
-    releases, odds, told = [], [], []
+) -> Example:
+    """Release each secret by its defense. All defenses release equally many words."""
+    releases, odds, labels = [], [], []
     for secret, defense in zip(secrets, defenses, strict=True):
         release = defense.protect(secret, public, rng)
         if not isinstance(release, WordSets) or release.words is None:
             raise TypeError(f"{defense.name()} releases no words of a dictionary")
-        true = release.words == true_words(defense, secret, public)[:, None]  # (N, m)
-        told.append(np.where(true.any(axis=1), true.argmax(axis=1), release.subset_size))
+        true = release.words == find_true_words(defense, secret, public)[:, None]  # (N, m)
+        labels.append(np.where(true.any(axis=1), true.argmax(axis=1), release.subset_size))
         odds.append(prior_odds(defense, public, release.subset_size))
         releases.append(release)
-    return Lesson(
-        scene(releases, odds, neighbours),
-        torch.from_numpy(np.concatenate(told)),
+    return Example(
+        build_graph(releases, odds, neighbours),
+        torch.from_numpy(np.concatenate(labels)),
         torch.from_numpy(np.concatenate([secret.descriptors for secret in secrets])),
     )
 
 
-def true_words(defense: Defense, secret: Features, public: Public) -> Indices:
-    """The words that a defense quantises descriptors to. -> (N,)"""
+def find_true_words(defense: Defense, secret: Features, public: Public) -> Indices:
+    """Return the words that a defense quantises descriptors to. -> (N,)"""
     if defense.dictionary_field is None:
         raise TypeError(f"{defense.name()} does not quantise")
     words = 0 if defense.word_count_field is None else getattr(defense, defense.word_count_field)
     return public.nearest_words(getattr(defense, defense.dictionary_field), secret, words)
 
 
-def lessons(
+def build_sampler(
     views: Sequence[PhotographView],
     defense: Defense,
-    served: Served,
+    supported: SupportedSettings,
     size: str,
     public: Public,
     neighbours: int,
     batch: int,
-) -> Callable[[np.random.Generator], Lesson]:
-    """Draws random crops of random views, each under random settings but for the field `size`, which a lesson has one of."""
+) -> Callable[[np.random.Generator], Example]:
+    """Return a function that draws examples: random crops of random views under random settings.
 
-    def draw(rng: np.random.Generator) -> Lesson:
-        secrets = [random_crop(views[number], rng)[1] for number in rng.integers(len(views), size=batch)]
-        common = {size: served[size].sample(rng)}
-        settings = [{field: setting.sample(rng) for field, setting in served.items()} | common for _ in secrets]
-        defenses = [dataclasses.replace(defense, **drawn) for drawn in settings]  # type: ignore[type-var]  # plugins are dataclasses
-        return lesson(secrets, defenses, public, neighbours, rng)
+    The field `size` is the same for all crops of an example.
+    """
+
+    def draw(rng: np.random.Generator) -> Example:
+        secrets = [draw_crop(views[number], rng)[1] for number in rng.integers(len(views), size=batch)]
+        common = {size: supported[size].sample(rng)}
+        settings = [{field: setting.sample(rng) for field, setting in supported.items()} | common for _ in secrets]
+        defenses = [dataclasses.replace(defense, **values) for values in settings]  # type: ignore[type-var]  # plugins are dataclasses
+        return build_example(secrets, defenses, public, neighbours, rng)
 
     return draw
 
 
-def loss(module: Surroundings, taught: Lesson) -> Tensor:
-    """As at the top of this file."""
-    belief = module(taught.scene)
-    cosine = (belief.mean(taught.scene.candidates) * taught.truth).sum(dim=1).mean()
-    return nnf.cross_entropy(belief.logits, taught.told) + 1 - cosine
+def compute_loss(module: ContextModel, example: Example) -> Tensor:
+    """Return the loss defined at the top of this file. -> ()"""
+    belief = module(example.graph)
+    cosine = (belief.mean(example.graph.candidates) * example.descriptors).sum(dim=1).mean()
+    return nnf.cross_entropy(belief.logits, example.labels) + 1 - cosine
 
 
-def fit(shape: Shape, draw: Callable[[np.random.Generator], Lesson], training: Training) -> Surroundings:
-    """Train from random weights on the lessons of generators seeded by (seed, step), and return the moving average."""
+def fit(shape: Shape, draw: Callable[[np.random.Generator], Example], training: Training) -> ContextModel:
+    """Train from random weights on examples drawn with generators of seed (seed, step), and return the moving average."""
     torch.manual_seed(training.seed)
     device = pick_device()
-    module = Surroundings(shape).to(device)
+    module = ContextModel(shape).to(device)
     average = {name: value.clone() for name, value in module.state_dict().items()}
     optimizer = torch.optim.AdamW(module.parameters(), training.rate, weight_decay=training.decay)
     started, smooth = time.monotonic(), math.nan
@@ -112,14 +113,14 @@ def fit(shape: Shape, draw: Callable[[np.random.Generator], Lesson], training: T
             factor = min((step + 1) / training.warmup, 0.5 * (1 + math.cos(math.pi * step / training.steps)))
             for group in optimizer.param_groups:
                 group["lr"] = training.rate * factor
-            value = loss(module, draw(np.random.default_rng([training.seed, step])).to(device))
+            value = compute_loss(module, draw(np.random.default_rng([training.seed, step])).to(device))
             optimizer.zero_grad(set_to_none=True)
             value.backward()
             torch.nn.utils.clip_grad_norm_(module.parameters(), 1.0)
             optimizer.step()
-            keep = min(training.average, (step + 1) / (step + 10))  # short memory while weights still run away
+            decay = min(training.average, (step + 1) / (step + 10))  # short memory while the weights still change fast
             for name, weight in module.state_dict().items():
-                average[name].lerp_(weight, 1 - keep)
+                average[name].lerp_(weight, 1 - decay)
             smooth = float(value.detach()) if math.isnan(smooth) else 0.98 * smooth + 0.02 * float(value.detach())
             speed = (step + 1) * training.batch / (time.monotonic() - started)
             progress.advance(1, f"loss {smooth:.4f}, {speed:.1f} images/s")
@@ -129,28 +130,27 @@ def fit(shape: Shape, draw: Callable[[np.random.Generator], Lesson], training: T
 
 @torch.no_grad()
 def validate(
-    module: Surroundings, secrets: Sequence[Features], defense: Defense, public: Public, seed: int = 0
+    module: ContextModel, secrets: Sequence[Features], defense: Defense, public: Public, seed: int = 0
 ) -> dict[str, float]:
-    """Means over photographs.
+    """Return means over photographs.
 
-    `posterior` and `prior` are cross-entropies in nats; `picked` is the share of keypoints whose true word has the greatest
-    chance of the candidates, `chance` that of a random candidate being it; `angle` is that between the posterior mean and the
-    descriptor, in degrees.
+    `posterior` and `prior` are cross-entropies in nats; `picked` is the fraction of keypoints whose true word is the likeliest
+    candidate, `chance` the same for a random candidate. `angle` is between the posterior mean and the descriptor, in degrees.
     """
     scores = []
     for number, secret in enumerate(secrets):
-        taught = lesson([secret], [defense], public, module.shape.neighbours, np.random.default_rng([seed, number]))
-        taught = taught.to(pick_device())
-        belief = module(taught.scene)
-        prior = Belief(taught.scene.odds[:, None].expand_as(belief.odds), belief.expected)
-        cosine = (belief.mean(taught.scene.candidates) * taught.truth).sum(dim=1).clamp(-1, 1)
+        example = build_example([secret], [defense], public, module.shape.neighbours, np.random.default_rng([seed, number]))
+        example = example.to(pick_device())
+        belief = module(example.graph)
+        prior = Belief(example.graph.odds[:, None].expand_as(belief.odds), belief.expected)
+        cosine = (belief.mean(example.graph.candidates) * example.descriptors).sum(dim=1).clamp(-1, 1)
         size = belief.odds.shape[1]
         scores.append(
             {
-                "posterior": nnf.cross_entropy(belief.logits, taught.told),
-                "prior": nnf.cross_entropy(prior.logits, taught.told),
-                "picked": (belief.odds.argmax(dim=1) == taught.told).float().mean(),
-                "chance": (taught.told < size).float().mean() / size,
+                "posterior": nnf.cross_entropy(belief.logits, example.labels),
+                "prior": nnf.cross_entropy(prior.logits, example.labels),
+                "picked": (belief.odds.argmax(dim=1) == example.labels).float().mean(),
+                "chance": (example.labels < size).float().mean() / size,
                 "angle": torch.rad2deg(torch.arccos(cosine)).mean(),
             }
         )

@@ -1,4 +1,4 @@
-"""The network on disk: half-precision safetensors whose metadata say what releases it was trained for."""
+"""The network on disk: half-precision safetensors whose metadata describe the releases that it was trained for."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from bench.context.network import Shape, Surroundings
+from bench.context.network import ContextModel, Shape
 from bench.core.device import pick_device
 from bench.core.errors import UserError
 from bench.formats import tensor_file
@@ -20,26 +20,26 @@ KIND = "surroundings-network"
 
 @dataclass(frozen=True, eq=False)
 class Network:
-    """A trained network, ready to weigh words."""
+    """A trained network, ready for inference."""
 
-    module: Surroundings
+    module: ContextModel
     meta: dict[str, Any]
     digest: str
 
 
-def save(path: Path, module: Surroundings, meta: dict[str, Any]) -> str:
-    """Write the weights in half precision, but for tensors that do not fit into it, and return the file's digest."""
-    arrays = {name: tensor_file.halved(value.cpu().numpy()) for name, value in module.state_dict().items()}
+def save(path: Path, module: ContextModel, meta: dict[str, Any]) -> str:
+    """Write the weights in half precision, where they fit into it, and return the file's digest."""
+    arrays = {name: tensor_file.to_half(value.cpu().numpy()) for name, value in module.state_dict().items()}
     return tensor_file.save(path, KIND, arrays, {**meta, "shape": asdict(module.shape)})
 
 
 def load(path: Path) -> Network:
-    """Read a network and verify it; once for a file that does not change.
+    """Read and verify a network; an unchanged file is read once.
 
     Raises
     ------
     UserError
-        if the file is damaged, or its tensors are not those of the network that it describes.
+        if the file is damaged, or its tensors do not match its metadata.
     """
     status = path.stat() if path.is_file() else None
     return _load(path, status and (status.st_mtime_ns, status.st_size))
@@ -48,9 +48,9 @@ def load(path: Path) -> Network:
 @functools.lru_cache(maxsize=4)
 def _load(path: Path, version: object) -> Network:
     arrays, meta, digest = tensor_file.load(path, KIND)
-    module = Surroundings(Shape(**meta["shape"]))
+    module = ContextModel(Shape(**meta["shape"]))
     try:
         module.load_state_dict({name: torch.from_numpy(array.astype(np.float32)) for name, array in arrays.items()})
     except RuntimeError as error:
-        raise UserError(f"{path}: its tensors are not those of the network that it describes: {error}") from error
+        raise UserError(f"{path}: tensors do not match the metadata: {error}") from error
     return Network(module.eval().to(pick_device()), meta, digest)

@@ -1,1 +1,1 @@
-"""What everything else may use: errors, exact numbers, devices, threads, randomness, progress, the environment."""
+"""Errors, exact numbers, hashes, devices, threads, randomness, progress and the environment. Imports no other layer."""

@@ -1,4 +1,4 @@
-"""COLMAP without its log, which tells of every image."""
+"""Silences COLMAP's log, which has lines for every image."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from contextlib import contextmanager
 
 import pycolmap
 
-ERRORS = 2  # glog's level
+ERRORS = 2  # level of glog
 
 
 @contextmanager
-def quietly() -> Iterator[None]:
-    """Only errors are told."""
+def silence_colmap() -> Iterator[None]:
+    """Log COLMAP's errors only, inside a `with` statement."""
     before = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = ERRORS
     try:

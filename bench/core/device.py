@@ -1,4 +1,4 @@
-"""Which device and which number format heavy arithmetic runs in."""
+"""The device and the number format of heavy arithmetic."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import torch
 
 
 def pick_device() -> torch.device:
-    """CUDA where there is one, else Apple's MPS, else the CPU."""
+    """Return CUDA if available, else Apple's MPS, else the CPU."""
     if torch.cuda.is_available():
         return torch.device("cuda")
     if torch.backends.mps.is_available():
@@ -15,16 +15,16 @@ def pick_device() -> torch.device:
 
 
 def pick_double_device() -> torch.device:
-    """The device for float64, which MPS does not have."""
+    """Return the device for float64: MPS does not support it."""
     device = pick_device()
     return torch.device("cpu") if device.type == "mps" else device
 
 
 def pick_dtype(device: torch.device) -> torch.dtype:
-    """bf16 where the hardware multiplies it faster than float32, else float32."""
+    """Return bf16 if the hardware multiplies it faster than float32, else float32."""
     if device.type == "cuda":
         return torch.bfloat16 if torch.cuda.is_bf16_supported() else torch.float32
     if device.type == "cpu":
-        has = torch.cpu.get_capabilities()
-        return torch.bfloat16 if has.get("amx_bf16") or has.get("avx512_bf16") else torch.float32
+        capabilities = torch.cpu.get_capabilities()
+        return torch.bfloat16 if capabilities.get("amx_bf16") or capabilities.get("avx512_bf16") else torch.float32
     return torch.float32

@@ -1,4 +1,7 @@
-"""What ran: our own source, the libraries, the device. It goes into every record and decides what a resumed run may skip."""
+"""The environment of a run: our own source, the libraries, the device.
+
+Every record holds it. A resumed run skips the records of the same environment only.
+"""
 
 from __future__ import annotations
 
@@ -13,18 +16,18 @@ from pathlib import Path
 from typing import Any
 
 DISTRIBUTION = "feature-privacy-bench"
-# Without `suites`, which say what is run, and have no part in how.
+# `suites` is left out: a suite selects experiments and does not change their results.
 PACKAGES = ("attacks", "bench", "defenses", "leaderboard", "metrics")
 LIBRARIES = ("numpy", "opencv-python-headless", "pillow", "poselib", "pycolmap", "scikit-image", "torch")
 
 
 def describe(plugins: Iterable[object]) -> dict[str, Any]:
-    """The environment as records hold it. `plugins` are those that take part; their files count as source."""
-    return {"version": version(DISTRIBUTION), "source": source_digest(plugins), **computing()}
+    """Return the environment for records. The files of `plugins` count as source."""
+    return {"version": version(DISTRIBUTION), "source": hash_source(plugins), **describe_platform()}
 
 
-def computing() -> dict[str, Any]:
-    """All of the environment that numbers may depend on beside our own source."""
+def describe_platform() -> dict[str, Any]:
+    """Return what numbers may depend on besides our own source: Python, libraries, machine, device, threads."""
     import torch
 
     from bench.core.device import pick_device, pick_dtype
@@ -32,7 +35,7 @@ def computing() -> dict[str, Any]:
     device = pick_device()
     return {
         "python": platform.python_version(),
-        **libraries(),
+        **list_library_versions(),
         "machine": f"{platform.system()} {platform.machine()}",
         "device": device.type,
         "dtype": str(pick_dtype(device)).removeprefix("torch."),
@@ -40,18 +43,22 @@ def computing() -> dict[str, Any]:
     }
 
 
-def libraries() -> dict[str, str]:
-    """The versions of those libraries that results depend on."""
+def list_library_versions() -> dict[str, str]:
+    """Return the versions of the libraries that results depend on."""
     return {library: version(library) for library in LIBRARIES}
 
 
-def source_digest(plugins: Iterable[object]) -> str:
-    """SHA-256 over every Python file of our packages, and of plugins that come from elsewhere."""
-    files = {f"{package}/{path.relative_to(root).as_posix()}": path for package, root in _roots() for path in root.rglob("*.py")}
+def hash_source(plugins: Iterable[object]) -> str:
+    """Return the SHA-256 of every Python file of our packages and of external plugins."""
+    files = {
+        f"{package}/{path.relative_to(root).as_posix()}": path
+        for package, root in _find_packages()
+        for path in root.rglob("*.py")
+    }
     for plugin in plugins:
         module = type(plugin).__module__
         if module.partition(".")[0] not in PACKAGES:
-            with contextlib.suppress(TypeError, OSError):  # a plugin typed into a session has no file
+            with contextlib.suppress(TypeError, OSError):  # a plugin defined in an interactive session has no file
                 files[module] = Path(inspect.getfile(type(plugin)))
     digest = hashlib.sha256()
     for name in sorted(files):
@@ -59,15 +66,15 @@ def source_digest(plugins: Iterable[object]) -> str:
     return "sha256:" + digest.hexdigest()
 
 
-def file_digest(plugin: object) -> str | None:
-    """SHA-256 of the file that a plugin is in, if it is in one. It tells whose code changed, but not that of what it calls."""
+def hash_plugin_file(plugin: object) -> str | None:
+    """Return the SHA-256 of a plugin's file, None if it has no file. The code that the plugin calls is not covered."""
     with contextlib.suppress(TypeError, OSError):
         return "sha256:" + hashlib.sha256(Path(inspect.getfile(type(plugin))).read_bytes()).hexdigest()
     return None
 
 
-def _roots() -> Iterable[tuple[str, Path]]:
+def _find_packages() -> Iterable[tuple[str, Path]]:
     for package in PACKAGES:
         spec = importlib.util.find_spec(package)
-        for place in (spec.submodule_search_locations or ()) if spec else ():
-            yield package, Path(place)
+        for folder in (spec.submodule_search_locations or ()) if spec else ():
+            yield package, Path(folder)

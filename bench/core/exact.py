@@ -1,4 +1,4 @@
-"""Numbers kept as they were written, as a decimal or a fraction, beside the double that is nearest to them."""
+"""Numbers that keep the decimal or fraction as written beside the nearest double."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ INFINITE = ("inf", "infinity")
 
 
 class Exact(float):
-    """A number such as `Exact("0.1")`, `Exact("1/3")` or `Exact("inf")`: a float where floats are used, exact in `fraction`.
+    """A float with its exact value in `fraction`, such as `Exact("0.1")`, `Exact("1/3")` or `Exact("inf")`.
 
     Raises
     ------
     ValueError
-        if the text is no number, or one too large for a double.
+        if the text is not a number, or too large for a double.
     """
 
     fraction: Fraction | None  # None if infinite
@@ -22,28 +22,28 @@ class Exact(float):
     def __new__(cls, value: str | float | Decimal | Fraction) -> Exact:
         infinite = str(value).strip().lstrip("+-").lower() in INFINITE
         try:
-            fraction = None if infinite else exact(value)
-            found = super().__new__(cls, value if fraction is None else fraction)
+            fraction = None if infinite else to_fraction(value)
+            number = super().__new__(cls, value if fraction is None else fraction)
         except (ZeroDivisionError, OverflowError) as error:
             raise ValueError(f"{value!r}: {error}") from None
-        found.fraction = fraction
-        return found
+        number.fraction = fraction
+        return number
 
     def __str__(self) -> str:
-        """As a decimal where a double's shortest one says it all, else as a fraction; `Exact` reads back either."""
+        """Return the shortest decimal if it is exact, else the fraction. `Exact` reads both."""
         short = float.__repr__(self)
         return short if self.fraction is None or self.fraction == Fraction(short) else str(self.fraction)
 
     __repr__ = __str__
 
 
-def exact(value: str | float | Decimal | Fraction) -> Fraction:
-    """The finite number that is meant: of an `Exact` its fraction, of another float the decimal that `repr` prints.
+def to_fraction(value: str | float | Decimal | Fraction) -> Fraction:
+    """Return a finite number as a fraction. A float that is not `Exact` stands for the decimal that `repr` prints.
 
     Raises
     ------
     ValueError, OverflowError
-        if it is none.
+        if `value` is not a finite number.
     """
     if isinstance(value, Exact):
         if value.fraction is None:

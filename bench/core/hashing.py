@@ -1,4 +1,4 @@
-"""Hashes of JSON values, which identify configurations, inputs and results."""
+"""Hashes of JSON values. They identify configurations, inputs and results."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import json
 from typing import Any
 
 
-def canonical(value: Any) -> str:
-    """Return JSON with sorted keys and without spaces, so that equal values give equal text.
+def canonical_json(value: Any) -> str:
+    """Return JSON with sorted keys and no spaces: equal values give equal text.
 
     Raises
     ------
@@ -20,9 +20,9 @@ def canonical(value: Any) -> str:
 
 def short_hash(value: Any) -> str:
     """Return the first 64 bits of the SHA-256 of the canonical JSON, in hexadecimal."""
-    return hashlib.sha256(canonical(value).encode()).hexdigest()[:16]
+    return hashlib.sha256(canonical_json(value).encode()).hexdigest()[:16]
 
 
 def digest(value: Any) -> str:
     """Return `sha256:` and the SHA-256 of the canonical JSON, in hexadecimal."""
-    return "sha256:" + hashlib.sha256(canonical(value).encode()).hexdigest()
+    return "sha256:" + hashlib.sha256(canonical_json(value).encode()).hexdigest()

@@ -1,4 +1,4 @@
-"""Progress on stderr: a bar on a terminal, a line now and then elsewhere."""
+"""Progress on stderr: a bar on a terminal, else a line every 20 seconds."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as Bar
 
-EVERY = 20.0  # seconds between lines where stderr is no terminal
+INTERVAL = 20.0  # seconds between lines if stderr is not a terminal
 
 
 class Progress:
-    """Counts units of work that take a while; `say` prints a line beside the bar."""
+    """Shows how much of `total` is done. `log` prints a line above the bar."""
 
     def __init__(self, title: str, total: int) -> None:
         self._title, self._total, self._done = title, total, 0
@@ -32,14 +32,14 @@ class Progress:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         self._bar.stop()
 
-    def advance(self, units: int = 1, note: str = "") -> None:
-        self._done += units
-        self._bar.update(self._task, advance=units, description=f"{self._title} {note}".rstrip())
+    def advance(self, count: int = 1, note: str = "") -> None:
+        self._done += count
+        self._bar.update(self._task, advance=count, description=f"{self._title} {note}".rstrip())
         now = time.monotonic()
-        if not self._console.is_terminal and (now - self._last > EVERY):
+        if not self._console.is_terminal and (now - self._last > INTERVAL):
             self._last = now
             left = (now - self._started) / self._done * (self._total - self._done) if self._done else 0.0
             print(f"{self._title}: {self._done}/{self._total} {note} {left:.0f} s left", file=sys.stderr, flush=True)
 
-    def say(self, line: str) -> None:
+    def log(self, line: str) -> None:
         self._console.print(line, markup=False, highlight=False, soft_wrap=True)

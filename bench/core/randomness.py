@@ -1,4 +1,4 @@
-"""Generators that are functions of what they are for, so that no result depends on what was done before it."""
+"""Random generators derived from their purpose. No result depends on the order of computations."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from bench.core.hashing import canonical
+from bench.core.hashing import canonical_json
 
 
-def randomness(*parts: Any) -> np.random.Generator:
-    """A generator that is a function of `parts` alone, which are JSON."""
-    return np.random.default_rng(int(hashlib.sha256(canonical(parts).encode()).hexdigest(), 16))
+def derive_generator(*parts: Any) -> np.random.Generator:
+    """Return a generator that is a function of `parts` alone. Parts are JSON values."""
+    return np.random.default_rng(int(hashlib.sha256(canonical_json(parts).encode()).hexdigest(), 16))

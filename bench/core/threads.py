@@ -1,4 +1,4 @@
-"""How many threads a process computes with, so that processes that share a machine do not get in each other's way."""
+"""Limits the threads of a process, so that processes can share a machine."""
 
 from __future__ import annotations
 
@@ -8,22 +8,22 @@ import os
 VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
-def cores() -> int:
-    """Those that this process may use; a batch system may have given it a few of the machine's."""
+def count_cores() -> int:
+    """Return the number of cores that this process may use. A batch system may grant only some."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @functools.lru_cache(maxsize=1)
-def limit(count: int) -> None:
-    """Let this process compute with so many threads, and those that it starts as well.
+def limit_threads(count: int) -> None:
+    """Limit this process and its child processes to `count` threads.
 
-    Records say how many threads were used, so this is done before planning.
+    Records hold the number of threads: call this before planning.
     """
     import cv2
     import torch
     from threadpoolctl import threadpool_limits
 
-    for variable in VARIABLES:  # for libraries that are loaded later, and for processes that are started
+    for variable in VARIABLES:  # for libraries loaded later and for child processes
         os.environ[variable] = str(count)
     torch.set_num_threads(count)
     cv2.setNumThreads(count)

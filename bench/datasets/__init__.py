@@ -1,1 +1,1 @@
-"""Where photographs come from."""
+"""Datasets, one file each, which sets `PLUGIN`."""

@@ -5,8 +5,8 @@
                                                 v1.1: aachen_v_1_1/, a COLMAP model, or an NVM with database_intrinsics_v1_1.txt
     queries/{day,night}_time_queries_with_intrinsics*.txt
 
-The poses of its queries are withheld. A file ground_truth.txt, which the download does not have, is read where it is: the gallery
-writes this layout too.
+The poses of its queries are withheld. A file ground_truth.txt, which the download does not have, is read if it exists: the gallery
+is exported in this layout too.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import pycolmap
 from bench.api import Dataset
 from bench.core.errors import UserError
 from bench.datasets import colmap
-from bench.datasets.colmap import Placed
+from bench.datasets.colmap import PosedImage
 from bench.formats import lists, nvm
 from bench.images.scene import Condition, Scene
 
@@ -34,7 +34,7 @@ MODELS: Mapping[Version, tuple[str, ...]] = {
 }
 INTRINSICS = "database_intrinsics*.txt"  # beside the NVM
 QUERIES = "{}_time_queries_with_intrinsics*.txt"
-LATER = re.compile(r"v?1[._]1\.txt$")  # how a list of version 1.1 is named
+VERSION_1_1 = re.compile(r"v?1[._]1\.txt$")  # the end of the name of a list of version 1.1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +42,7 @@ class Aachen(Dataset):
     """Aachen Day-Night as downloaded."""
 
     path: Path
-    version: Version | None = None  # needed where both are there
+    version: Version | None = None  # required if the folder holds both
 
     def scene(self) -> Scene:
         return load(self.path, self.version)
@@ -51,24 +51,24 @@ class Aachen(Dataset):
 def load(root: Path, version: Version | None = None) -> Scene:
     """Read the download.
 
-    `version` says which of two is meant where both are there; a list of queries that only one name stands for serves both.
+    `version` selects one if the folder holds both. A condition's only list of queries is used for either version.
 
     Raises
     ------
     UserError
-        naming file and line, if something is missing, damaged, or there in both versions and none was asked for.
+        naming file and line, if something is missing, damaged, or ambiguous without a version.
     """
     if not root.is_dir():
         raise UserError(f"{root}: no such folder")
     upright = [folder for folder in (root / "images" / "images_upright", root / "images_upright") if folder.is_dir()]
     if not upright:
-        raise UserError(f"{root}: neither images_upright/ nor images/images_upright/ is there")
+        raise UserError(f"{root}: neither images_upright/ nor images/images_upright/ exists")
     return colmap.assemble(
         "aachen",
-        references=_references(root, version),
-        queries={condition: _queries(root, condition, version) for condition in get_args(Condition)},
+        references=_read_references(root, version),
+        queries={condition: _find_query_list(root, condition, version) for condition in get_args(Condition)},
         images=upright[0],
-        ground_truth=colmap.ground_truth(root),
+        ground_truth=colmap.find_ground_truth(root),
         masks=root / "foreground",
     )
 
@@ -78,80 +78,80 @@ def write_evaluation(folder: Path, method: str, poses: Mapping[str, pycolmap.Rig
 
     Parameters
     ----------
-    poses : camera from world of each query, by its name; None if it was not localized, which leaves it out
+    poses : camera from world of each query, by its name; None if it was not localized: such queries are left out
 
     Returns
     -------
-    The file, and how many queries were left out.
+    The file, and the number of queries left out.
 
     Raises
     ------
     UserError
-        if the method's name cannot be a file's, or two queries have one basename.
+        if the method's name cannot be part of a file name, or two queries have one basename.
     """
     if not re.fullmatch(r"[\w.+-]+", method):
-        raise UserError(f"method {method!r}: only letters, digits and . _ + - may be in it")
+        raise UserError(f"method {method!r}: use only letters, digits and . _ + -")
     by_base: dict[str, pycolmap.Rigid3d | None] = {}
     for name, pose in poses.items():
         base = name.rpartition("/")[2]
         if base in by_base:
-            raise UserError(f"{name}: another query is called {base} as well, and the server tells them by that")
+            raise UserError(f"{name}: another query has the same basename {base}, by which the server identifies queries")
         by_base[base] = pose
     path = folder / f"Aachen_eval_{method}.txt"
-    found = {base: pose for base, pose in by_base.items() if pose is not None}
-    lists.write_poses(path, found)
-    return path, len(poses) - len(found)
+    localized = {base: pose for base, pose in by_base.items() if pose is not None}
+    lists.write_poses(path, localized)
+    return path, len(poses) - len(localized)
 
 
-def _references(root: Path, version: Version | None) -> dict[str, Placed]:
+def _read_references(root: Path, version: Version | None) -> dict[str, PosedImage]:
     folder = root / "3D-models"
-    there = [
+    models = [
         (number, path)
         for number, names in MODELS.items()
         if version in (None, number)
         for path in [next((folder / name for name in names if _is_model(folder / name)), None)]
         if path is not None
     ]
-    if not there:
-        raise UserError(f"{folder}: no model of Aachen {version or 'v1 or v1.1'}; see the head of bench/datasets/aachen.py")
-    if len(there) > 1:
-        raise UserError(f"{folder}: models of both versions are there; say which, v1 or v1.1")
-    path = there[0][1]
-    return colmap.read_model(path) if path.is_dir() else _from_nvm(path)
+    if not models:
+        raise UserError(f"{folder}: no model of Aachen {version or 'v1 or v1.1'}; bench/datasets/aachen.py describes the layout")
+    if len(models) > 1:
+        raise UserError(f"{folder}: holds models of both versions; give version=v1 or version=v1.1")
+    path = models[0][1]
+    return colmap.read_model(path) if path.is_dir() else _read_nvm(path)
 
 
 def _is_model(path: Path) -> bool:
     return path.is_file() if path.suffix == ".nvm" else colmap.is_model(path)
 
 
-def _from_nvm(path: Path) -> dict[str, Placed]:
-    """The NVM's poses with the intrinsics beside it."""
+def _read_nvm(path: Path) -> dict[str, PosedImage]:
+    """Read the NVM's poses with the intrinsics beside it."""
     beside = sorted(path.parent.glob(INTRINSICS))
     if len(beside) != 1:
         raise UserError(f"{path.parent}: {len(beside)} files {INTRINSICS} beside {path.name}; expected one")
     cameras = lists.read_intrinsics(beside[0])
-    found = {}
+    references = {}
     for name, (line, pose) in nvm.read(path).items():
         key = name.removeprefix("./")
         if key not in cameras:
             raise UserError(f"{path}:{line}: {name} has no intrinsics in {beside[0]}")
-        found[key] = f"{path}:{line}", cameras[key][1], pose
-    return found
+        references[key] = f"{path}:{line}", cameras[key][1], pose
+    return references
 
 
-def _queries(root: Path, condition: Condition, version: Version | None) -> Path:
-    """The one list of queries of that condition and version."""
+def _find_query_list(root: Path, condition: Condition, version: Version | None) -> Path:
+    """Find the list of queries of that condition and version."""
     folder, pattern = root / "queries", QUERIES.format(condition)
-    there = sorted(folder.glob(pattern))
-    if not there:
+    candidates = sorted(folder.glob(pattern))
+    if not candidates:
         raise UserError(f"{folder / pattern}: no such file")
-    if len(there) > 1 and version is None:
+    if len(candidates) > 1 and version is None:
         raise UserError(f"{folder}: {' and '.join(path.name for path in there)} are both there; say which version, v1 or v1.1")
-    if len(there) > 1:
-        there = [path for path in there if bool(LATER.search(path.name)) == (version == "v1.1")]
-    if len(there) != 1:
-        raise UserError(f"{folder / pattern}: cannot tell which of these lists is of version {version}")
-    return there[0]
+    if len(candidates) > 1:
+        candidates = [path for path in candidates if bool(VERSION_1_1.search(path.name)) == (version == "v1.1")]
+    if len(candidates) != 1:
+        raise UserError(f"{folder / pattern}: not exactly one of these lists is of version {version}")
+    return candidates[0]
 
 
 PLUGIN = Aachen

@@ -1,12 +1,12 @@
-"""Any COLMAP model as a scene: its images are the references; queries stand in lists with intrinsics.
+"""Any COLMAP model as a scene: its images are the references; lists with intrinsics name the queries.
 
-A folder is expected to hold
+The folder holds
 
     images/                                     references and queries
     sparse/ or sparse/0/                        the model, as text or binary
     queries/{day,night}_queries_with_intrinsics.txt    either or both
-    ground_truth.txt                            if there is some: poses of the queries, or a folder of that name with a model
-    foreground/                                 if there are some: masks by the images' names, white where something moves
+    ground_truth.txt                            optional: poses of the queries, or a folder of that name with a model
+    foreground/                                 optional: masks by the images' names, white where something moves
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Colmap(Dataset):
 
 
 def load(root: Path) -> Scene:
-    """Read a folder that is laid out as above.
+    """Read a folder in the layout above.
 
     Raises
     ------
@@ -60,58 +60,58 @@ def load(root: Path) -> Scene:
         references=read_model(models[0]),
         queries=present,
         images=root / "images",
-        ground_truth=ground_truth(root),
+        ground_truth=find_ground_truth(root),
         masks=root / "foreground",
     )
 
 
-def ground_truth(root: Path) -> Path | None:
-    """Where the poses of the queries are, if they are there."""
+def find_ground_truth(root: Path) -> Path | None:
+    """Find the file or folder with the poses of the queries; None if there is none."""
     return next((path for path in (root / "ground_truth.txt", root / "ground_truth") if path.exists()), None)
 
 
-Placed = tuple[str, pycolmap.Camera, pycolmap.Rigid3d]  # where it stands, for messages; intrinsics; camera from world
+PosedImage = tuple[str, pycolmap.Camera, pycolmap.Rigid3d]  # file and line, for messages; intrinsics; camera from world
 
 
 def assemble(
     name: str,
     *,
-    references: Mapping[str, Placed],
+    references: Mapping[str, PosedImage],
     queries: Mapping[Condition, Path],
     images: Path,
     ground_truth: Path | None = None,
     masks: Path | None = None,
 ) -> Scene:
-    """Put a scene together from references, lists of queries and the folder of all images.
+    """Assemble a scene from references, lists of queries and the folder of all images.
 
     Raises
     ------
     UserError
-        naming file and line, if a list is damaged, an image is missing, a name stands for two images, or a pose belongs to none.
+        naming file and line, if a list is damaged, an image is missing, a name is used twice, or a pose belongs to no query.
     """
-    poses = {} if ground_truth is None else _poses(ground_truth)
-    shown = [
+    poses = {} if ground_truth is None else _read_poses(ground_truth)
+    reference_images = [
         Reference(
-            name=name, camera=camera, cam_from_world=pose, condition="day", pixels=_file(name, where, camera, images, masks)
+            name=name, camera=camera, cam_from_world=pose, condition="day", pixels=_find_image(name, where, camera, images, masks)
         )
         for name, (where, camera, pose) in sorted(references.items())
     ]
-    asked: dict[str, SceneImage] = {}
+    query_images: dict[str, SceneImage] = {}
     for condition, path in queries.items():
         for query, (line, camera) in lists.read_intrinsics(path).items():
             where = f"{path}:{line}"
-            if query in references or query in asked:
+            if query in references or query in query_images:
                 raise UserError(f"{where}: {query} is {'a reference' if query in references else 'in another list'} as well")
-            pixels, pose = _file(query, where, camera, images, masks), poses.pop(query, (where, None))[1]
-            asked[query] = SceneImage(name=query, camera=camera, cam_from_world=pose, condition=condition, pixels=pixels)
+            pixels, pose = _find_image(query, where, camera, images, masks), poses.pop(query, (where, None))[1]
+            query_images[query] = SceneImage(name=query, camera=camera, cam_from_world=pose, condition=condition, pixels=pixels)
     if poses:
         stray, (where, _) = next(iter(poses.items()))
         raise UserError(f"{where}: a pose of {stray}, which is no query")
-    return Scene(name=name, references=tuple(shown), queries=tuple(asked.values()))
+    return Scene(name=name, references=tuple(reference_images), queries=tuple(query_images.values()))
 
 
-def read_model(folder: Path) -> dict[str, Placed]:
-    """The images of a COLMAP model that have a pose.
+def read_model(folder: Path) -> dict[str, PosedImage]:
+    """Read the images of a COLMAP model that have a pose.
 
     Raises
     ------
@@ -123,21 +123,21 @@ def read_model(folder: Path) -> dict[str, Placed]:
         model = pycolmap.Reconstruction(folder)
     except (ValueError, RuntimeError) as error:
         raise UserError(f"{folder}: not a whole COLMAP model: {error}") from None
-    found: dict[str, Placed] = {}
+    posed: dict[str, PosedImage] = {}
     for number, image in sorted(model.images.items()):
         where = wheres.get(image.name, f"{folder}, image {number}")
         if not image.has_pose:
             continue
-        if image.name in found:
+        if image.name in posed:
             raise UserError(f"{where}: {image.name} is in this model twice")
-        # Copies: what pycolmap hands out lies in the model, which ends here.
+        # Copies: pycolmap returns references into the model, which is freed on return.
         camera, pose = deepcopy(image.camera), image.cam_from_world()
         if not (np.isfinite(pose.matrix()).all() and np.isfinite(camera.params).all()):
             raise UserError(f"{where}: the pose or the intrinsics of {image.name} are not finite")
-        found[image.name] = where, camera, pose
-    if not found:
+        posed[image.name] = where, camera, pose
+    if not posed:
         raise UserError(f"{folder}: no image of this model has a pose")
-    return found
+    return posed
 
 
 def is_model(folder: Path) -> bool:
@@ -145,13 +145,13 @@ def is_model(folder: Path) -> bool:
 
 
 def _check_text(folder: Path) -> dict[str, str]:
-    """Check what pycolmap would take or refuse without saying where. -> each image's file and line"""
-    known = set()
-    for number, fields in lists.lines(folder / "cameras.txt"):
-        lists.camera(fields[1:], f"{folder / 'cameras.txt'}:{number}")
-        known.add(fields[0])
+    """Check what pycolmap would accept, or reject without a file and line. -> each image's file and line"""
+    cameras = set()
+    for number, fields in lists.read_fields(folder / "cameras.txt"):
+        lists.parse_camera(fields[1:], f"{folder / 'cameras.txt'}:{number}")
+        cameras.add(fields[0])
     path, wheres, points = folder / "images.txt", {}, False
-    for number, line in lists.rows(path):
+    for number, line in lists.read_lines(path):
         where = f"{path}:{number}"
         if points or line.startswith("#") or not line.strip():
             points = False  # the line after an image's holds its points, if any
@@ -159,22 +159,22 @@ def _check_text(folder: Path) -> dict[str, str]:
         fields = line.split()
         if len(fields) != 10:
             raise UserError(f"{where}: an image has 10 fields (id qw qx qy qz tx ty tz camera name), but there are {len(fields)}")
-        lists.pose(fields[1:8], where)
-        if fields[8] not in known:
+        lists.parse_pose(fields[1:8], where)
+        if fields[8] not in cameras:
             raise UserError(f"{where}: there is no camera {fields[8]} in {folder / 'cameras.txt'}")
         wheres[fields[9]] = where
         points = True
     return wheres
 
 
-def _poses(path: Path) -> dict[str, tuple[str, pycolmap.Rigid3d]]:
-    """Name -> where it stands, and camera from world, from a list of poses or a model."""
+def _read_poses(path: Path) -> dict[str, tuple[str, pycolmap.Rigid3d]]:
+    """Read a list of poses or a model. -> by name: file and line, and camera from world"""
     if path.is_dir():
         return {name: (where, pose) for name, (where, _, pose) in read_model(path).items()}
     return {name: (f"{path}:{line}", pose) for name, (line, pose) in lists.read_poses(path).items()}
 
 
-def _file(name: str, where: str, camera: pycolmap.Camera, images: Path, masks: Path | None) -> File:
+def _find_image(name: str, where: str, camera: pycolmap.Camera, images: Path, masks: Path | None) -> File:
     path = images / name
     if not path.is_file():
         raise UserError(f"{where}: there is no image {path}")

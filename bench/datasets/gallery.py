@@ -1,8 +1,8 @@
-"""The gallery: a made-up building that is rendered here, so its poses are exact and in metres, and nothing need be fetched.
+"""The gallery: a synthetic building, rendered on demand. Its poses are exact and in metres, and no download is needed.
 
-A courtyard and four rooms, hung with pictures (photographs that the libraries carry, and painted by chance), furnished, lit with
-shadows; references are taken on walks by day, queries beside those walks by day and by night, with people before them who are in
-no other image's map. Everything is a function of the fields of `Gallery`.
+A courtyard and four rooms with pictures (the libraries' photographs, and random drawings), furniture, and light with shadows.
+References are taken on walks by day, queries beside those walks by day and by night. People in the map and in queries differ.
+Everything is a function of the fields of `Gallery`.
 """
 
 from __future__ import annotations
@@ -24,33 +24,33 @@ from bench.images.scene import Condition, Mask, Pixels, Reference, Scene, SceneI
 from bench.rendering import crowd, cutouts, walks
 from bench.rendering.building import Building, build
 from bench.rendering.cutouts import Person
-from bench.rendering.raster import Eye, draw
+from bench.rendering.raster import PinholeCamera, draw
 from bench.rendering.rooms import ROOMS
-from bench.rendering.sensor import Sensor, expose, metered
+from bench.rendering.sensor import Sensor, expose, compute_gain
 from bench.rendering.walks import Station
 from bench.types import Bytes, Floats
 
 FIELD_OF_VIEW = np.radians(63.0)  # of the references, from left to right
-QUERY_ZOOMS = (0.92, 1.0, 1.15)  # focal lengths of the phones that queries are taken with, relative to the references'
-CAST = 12  # people to choose from
+QUERY_ZOOMS = (0.92, 1.0, 1.15)  # focal lengths of the queries' phones, relative to the references'
+PEOPLE = 12  # to choose from
 
 Kind = Literal["reference", "query"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Gallery(Dataset):
-    """A made-up building with pictures and people in it, rendered here; poses are exact and in metres."""
+    """A synthetic building with pictures and people, rendered on demand; poses are exact and in metres."""
 
     seed: int = 0
     views: int = 300  # reference images
     queries: int = 300
-    night: float = 1 / 3  # share of the queries
+    night: float = 1 / 3  # fraction of the queries
     width: int = 640  # pixels
     height: int = 480
-    rooms: int = len(ROOMS)  # how many of them are visited, the courtyard first
-    repeats: float = 0.1  # share of pictures that hang elsewhere as well
-    bare: float = 0.15  # share of places on the walls left empty
-    viewpoint: float = 1.0  # how far queries are from the walks: 1 is about 0.7 m and 20 degrees
+    rooms: int = len(ROOMS)  # rooms visited, the courtyard first
+    repeats: float = 0.1  # fraction of pictures that repeat another one
+    bare: float = 0.15  # fraction of wall positions left empty
+    viewpoint: float = 1.0  # distance of queries from the walks: 1 is about 0.7 m and 20 degrees
     people: float = 1.5  # in an image, on average
     blur: float = 1.0  # of queries; 1 is about a pixel
     noise: float = 1.0  # of queries; 1 is a good sensor's
@@ -61,23 +61,23 @@ class Gallery(Dataset):
             raise UserError(f"gallery: at least one view, neither queries nor seed negative, and 1 to {len(ROOMS)} rooms")
         if min(self.width, self.height) < 32 or not 0 < self.detail <= 4:
             raise UserError("gallery: images are at least 32 pixels wide and high, and detail is above 0 and at most 4")
-        if not all(0 <= share <= 1 for share in (self.night, self.repeats, self.bare)):
-            raise UserError("gallery: night, repeats and bare are shares from 0 to 1")
+        if not all(0 <= fraction <= 1 for fraction in (self.night, self.repeats, self.bare)):
+            raise UserError("gallery: night, repeats and bare are fractions from 0 to 1")
         if not all(0 <= amount < np.inf for amount in (self.viewpoint, self.people, self.blur, self.noise)):
             raise UserError("gallery: viewpoint, people, blur and noise are finite and not negative")
 
     def scene(self) -> Scene:
-        model = _model(self)
+        model = _load_model(self)
         return Scene(
             name="gallery",
-            references=tuple(_reference(model, index) for index in range(self.views)),
-            queries=tuple(_query(model, index) for index in range(self.queries)),
+            references=tuple(_create_reference(model, index) for index in range(self.views)),
+            queries=tuple(_create_query(model, index) for index in range(self.queries)),
         )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Shot:
-    """One rendered image with all that is known of it."""
+    """One rendered image with its foreground and depth."""
 
     pixels: Bytes  # (H, W, 3)
     foreground: Mask  # (H, W)
@@ -93,33 +93,35 @@ class Rendered(Pixels):
     index: int
 
     def content_hash(self) -> str:
-        return "sha256:" + hashlib.sha256(f"{_renderer()} {self}".encode()).hexdigest()
+        return "sha256:" + hashlib.sha256(f"{_hash_renderer()} {self}".encode()).hexdigest()
 
     def read(self) -> Bytes:
-        return shot(self.gallery, self.kind, self.index).pixels
+        return render(self.gallery, self.kind, self.index).pixels
 
     def foreground(self) -> Mask:
-        return shot(self.gallery, self.kind, self.index).foreground
+        return render(self.gallery, self.kind, self.index).foreground
 
 
-@lru_cache(maxsize=16)  # read and foreground ask for the same
-def shot(gallery: Gallery, kind: Kind, index: int) -> Shot:
+@lru_cache(maxsize=16)  # `read` and `foreground` need the same image
+def render(gallery: Gallery, kind: Kind, index: int) -> Shot:
     """Render one image."""
-    model = _model(gallery)
-    taken = model.taken[kind][index]
-    night = taken.condition == "night"
-    building, eye = model.building, _eye(taken)
-    mine = [gallery.seed, 7, int(kind == "query"), index]
-    present = crowd.gather(np.random.default_rng([*mine, 0]), _cast(gallery.seed)[kind], gallery.people, eye, building, night)
-    drawing = draw(eye, building.night if night else building.day, present, lambda rays: building.sky_at(rays, night))
-    sensor = _sensor(gallery, kind, night)
-    pixels = expose(drawing.light, sensor, metered(drawing.light), np.random.default_rng([*mine, 1]))
+    model = _load_model(gallery)
+    view = model.views[kind][index]
+    night = view.condition == "night"
+    building, camera = model.building, _create_pinhole_camera(view)
+    key = [gallery.seed, 7, int(kind == "query"), index]
+    people = crowd.gather_people(
+        np.random.default_rng([*key, 0]), _create_people(gallery.seed)[kind], gallery.people, camera, building, night
+    )
+    drawing = draw(camera, building.night if night else building.day, present, lambda rays: building.compute_sky(rays, night))
+    sensor = _choose_sensor(gallery, kind, night)
+    pixels = expose(drawing.light, sensor, compute_gain(drawing.light), np.random.default_rng([*key, 1]))
     return Shot(pixels=pixels, foreground=drawing.foreground, depth=drawing.depth)
 
 
 @cache
-def _renderer() -> str:
-    """Changes whenever the same fields may give other pixels."""
+def _hash_renderer() -> str:
+    """Hash everything except the fields that determines the pixels: source and library versions."""
     files = [*Path(bench.rendering.__path__[0]).glob("*.py"), Path(__file__)]
     parts = [file.read_text(encoding="utf-8") for file in sorted(files)]
     parts += [version(library) for library in ("numpy", "opencv-python-headless", "scikit-image", "scikit-learn", "matplotlib")]
@@ -127,8 +129,8 @@ def _renderer() -> str:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Taken:
-    """When, where and with what an image was taken."""
+class _View:
+    """The pose, camera and condition of an image."""
 
     name: str
     station: Station
@@ -138,92 +140,92 @@ class _Taken:
 
 @dataclass(frozen=True, eq=False)
 class _Model:
-    """What all images of one gallery share."""
+    """The building and the views of one gallery."""
 
     gallery: Gallery
 
     @property
     def building(self) -> Building:
         g = self.gallery
-        return _building(g.seed, g.repeats, g.bare, g.detail)
+        return _load_building(g.seed, g.repeats, g.bare, g.detail)
 
     @cached_property
-    def taken(self) -> dict[Kind, list[_Taken]]:
+    def views(self) -> dict[Kind, list[_View]]:
         g = self.gallery
         rooms = ROOMS[: g.rooms]
         by_day = g.queries - round(g.night * g.queries)
         references = [
-            _Taken(name=f"db/{room.name}-{lap}-{number:04d}.png", station=station, camera=_camera(g, 1.0), condition="day")
-            for number, (room, lap, station) in enumerate(walks.references(rooms, g.views, self.building, g.seed))
+            _View(name=f"db/{room.name}-{lap}-{number:04d}.png", station=station, camera=_create_camera(g, 1.0), condition="day")
+            for number, (room, lap, station) in enumerate(walks.generate_references(rooms, g.views, self.building, g.seed))
         ]
         queries = []
-        for number, (_, station) in enumerate(walks.queries(rooms, g.queries, self.building, g.seed, g.viewpoint)):
+        for number, (_, station) in enumerate(walks.generate_queries(rooms, g.queries, self.building, g.seed, g.viewpoint)):
             condition: Condition = "day" if number < by_day else "night"
             phone = int(np.random.default_rng([g.seed, 9, number]).integers(len(QUERY_ZOOMS)))
             name = f"query/{condition}/phone{phone}/{condition}-{number:04d}.png"
-            queries.append(_Taken(name=name, station=station, camera=_camera(g, QUERY_ZOOMS[phone]), condition=condition))
+            queries.append(_View(name=name, station=station, camera=_create_camera(g, QUERY_ZOOMS[phone]), condition=condition))
         return {"reference": references, "query": queries}
 
 
 @lru_cache(maxsize=8)
-def _model(gallery: Gallery) -> _Model:
+def _load_model(gallery: Gallery) -> _Model:
     return _Model(gallery)
 
 
 @lru_cache(maxsize=2)
-def _cast(seed: int) -> dict[Kind, list[Person]]:
+def _create_people(seed: int) -> dict[Kind, list[Person]]:
     rngs = (np.random.default_rng([seed, 8, number]) for number in range(2))
-    return {"reference": cutouts.of_map(next(rngs), CAST), "query": cutouts.of_queries(next(rngs), CAST)}
+    return {"reference": cutouts.create_map_people(next(rngs), PEOPLE), "query": cutouts.create_query_people(next(rngs), PEOPLE)}
 
 
 @lru_cache(maxsize=2)  # its textures are large
-def _building(seed: int, repeats: float, bare: float, detail: float) -> Building:
+def _load_building(seed: int, repeats: float, bare: float, detail: float) -> Building:
     return build(seed, repeats=repeats, bare=bare, detail=detail)
 
 
-def _camera(gallery: Gallery, zoom: float) -> pycolmap.Camera:
+def _create_camera(gallery: Gallery, zoom: float) -> pycolmap.Camera:
     focal = zoom * gallery.width / 2 / np.tan(FIELD_OF_VIEW / 2)
     return pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", round(float(focal), 3), gallery.width, gallery.height)
 
 
-def _reference(model: _Model, index: int) -> Reference:
-    taken = model.taken["reference"][index]
+def _create_reference(model: _Model, index: int) -> Reference:
+    view = model.views["reference"][index]
     return Reference(
-        name=taken.name,
-        camera=taken.camera,
-        cam_from_world=_pose(taken),
-        condition=taken.condition,
+        name=view.name,
+        camera=view.camera,
+        cam_from_world=_compute_pose(view),
+        condition=view.condition,
         pixels=Rendered(gallery=model.gallery, kind="reference", index=index),
     )
 
 
-def _query(model: _Model, index: int) -> SceneImage:
-    taken = model.taken["query"][index]
+def _create_query(model: _Model, index: int) -> SceneImage:
+    view = model.views["query"][index]
     return SceneImage(
-        name=taken.name,
-        camera=taken.camera,
-        cam_from_world=_pose(taken),
-        condition=taken.condition,
+        name=view.name,
+        camera=view.camera,
+        cam_from_world=_compute_pose(view),
+        condition=view.condition,
         pixels=Rendered(gallery=model.gallery, kind="query", index=index),
     )
 
 
-def _pose(taken: _Taken) -> pycolmap.Rigid3d:
-    rotation = taken.station.rotation
-    return pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ taken.station.centre)
+def _compute_pose(view: _View) -> pycolmap.Rigid3d:
+    rotation = view.station.rotation
+    return pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ view.station.centre)
 
 
-def _eye(taken: _Taken) -> Eye:
-    rotation = taken.station.rotation
-    return Eye(
-        calibration=taken.camera.calibration_matrix(),
+def _create_pinhole_camera(view: _View) -> PinholeCamera:
+    rotation = view.station.rotation
+    return PinholeCamera(
+        calibration=view.camera.calibration_matrix(),
         rotation=rotation,
-        translation=-rotation @ taken.station.centre,
-        size=(taken.camera.width, taken.camera.height),
+        translation=-rotation @ view.station.centre,
+        size=(view.camera.width, view.camera.height),
     )
 
 
-def _sensor(gallery: Gallery, kind: Kind, night: bool) -> Sensor:
+def _choose_sensor(gallery: Gallery, kind: Kind, night: bool) -> Sensor:
     if kind == "reference":
         return Sensor(defocus=0.4, shake=0.0, noise=1.0, cast=0.02)
     blur = gallery.blur * (1.3 if night else 1.0)

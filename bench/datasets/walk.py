@@ -1,7 +1,7 @@
-"""A stretch of a walk through the gallery's courtyard: views close to each other, as one takes them for structure from motion.
+"""A stretch of a walk through the gallery's courtyard: views close to each other, for structure from motion.
 
-The queries are consecutive views of the second lap, which looks across the courtyard, without people. The references, which a
-dictionary is made from, are views of both laps all around it, the stretch left out.
+The queries are consecutive views of the second lap, which looks across the courtyard, without people. The references, for the
+dictionary, are views of both laps outside the stretch.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from bench.images.scene import Scene
 
 @dataclass(frozen=True, kw_only=True)
 class Walk(Dataset):
-    """Consecutive views of a walk through a made-up courtyard, rendered here; poses are exact and in metres."""
+    """Consecutive views of a walk through a synthetic courtyard, rendered on demand; poses are exact and in metres."""
 
     seed: int = 0
     views: int = 25  # of the stretch
-    others: int = 150  # views of the courtyard that are not of the stretch
-    start: float = 0.3  # of the stretch, as a share of the lap
-    steps: int = 340  # views of a lap: the more, the closer
+    others: int = 150  # references: views of the courtyard outside the stretch
+    start: float = 0.3  # of the stretch, as a fraction of the lap
+    steps: int = 340  # views of a lap
     width: int = 640  # pixels
     height: int = 480
     detail: float = 1.0  # of textures and light; 1 is about a texel a pixel from 1.5 m away
@@ -46,15 +46,15 @@ class Walk(Dataset):
             height=self.height,
             detail=self.detail,
         )
-        taken = gallery.scene().references  # a lap after the other
+        images = gallery.scene().references  # one lap after the other
         first = self.steps + round(self.start * (self.steps - self.views))
         stretch = range(first, first + self.views)
-        rest = [index for index in range(len(taken)) if index not in stretch]
-        others = [rest[place] for place in np.linspace(0, len(rest) - 1, self.others).round().astype(int)]
+        rest = [index for index in range(len(images)) if index not in stretch]
+        references = [rest[position] for position in np.linspace(0, len(rest) - 1, self.others).round().astype(int)]
         return Scene(
             name="walk",
-            references=tuple(taken[index] for index in others),
-            queries=tuple(replace(taken[index]) for index in stretch),
+            references=tuple(images[index] for index in references),
+            queries=tuple(replace(images[index]) for index in stretch),
         )
 
 

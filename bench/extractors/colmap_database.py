@@ -14,7 +14,7 @@ import numpy as np
 
 from bench.api import Extractor
 from bench.core.errors import SampleError, UserError
-from bench.formats.stored_features import in_square, named, upright
+from bench.formats.stored_features import map_into_square, match_name, read_upright_size
 from bench.geometry.nearest_words import unit_rows
 from bench.types import Features
 
@@ -39,8 +39,8 @@ class ColmapDatabase(Extractor):
 
         if source is None:
             raise UserError("colmap-database: features are found by the photograph's file, and this one has none")
-        numbers = _images(self.path, self.path.stat().st_mtime_ns)
-        name = named(source, numbers)
+        numbers = _list_images(self.path, self.path.stat().st_mtime_ns)
+        name = match_name(source, numbers)
         if name is None:
             raise SampleError(f"{source.name}: {self.path} has no image of that name")
         number, size = numbers[name]
@@ -50,9 +50,9 @@ class ColmapDatabase(Extractor):
             keypoints, codes = database.read_keypoints(number)[:, :2], database.read_descriptors(number).data
         if len(keypoints) != len(codes):
             raise SampleError(f"{source.name}: {len(keypoints)} keypoints and {len(codes)} descriptors in {self.path}")
-        upright(source, size)
+        read_upright_size(source, size)
         side = image.shape[0]
-        xy = in_square(keypoints.astype(np.float64), size, side)  # (N, 2)
+        xy = map_into_square(keypoints.astype(np.float64), size, side)  # (N, 2)
         keep = ((xy >= 0) & (xy < side)).all(axis=1) & codes.any(axis=1)
         if not keep.any():
             raise SampleError(f"{source.name}: no keypoint of {self.path} lies in the photograph's central square")
@@ -62,7 +62,7 @@ class ColmapDatabase(Extractor):
 
 
 @lru_cache(maxsize=4)
-def _images(path: Path, changed: int) -> dict[str, tuple[int, tuple[int, int]]]:
+def _list_images(path: Path, changed: int) -> dict[str, tuple[int, tuple[int, int]]]:
     """Name -> number, and width and height, of each image of a database as it was at that time."""
     import pycolmap
 

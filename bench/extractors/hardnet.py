@@ -35,7 +35,7 @@ class HardNet(Extractor):
 
     def __post_init__(self) -> None:
         if self.weights == HUB:
-            object.__setattr__(self, "weights", _kept())
+            object.__setattr__(self, "weights", _find_weights())
         if not self.weights.is_file():
             raise UserError(f"hardnet: {self.weights}: no such file")
         if self.max_keypoints < 1:
@@ -44,12 +44,12 @@ class HardNet(Extractor):
     def extract(self, image: np.ndarray, source: Path | None = None) -> Features:
         found = Sift(max_keypoints=self.max_keypoints).extract(image, source)
         assert found.frames is not None
-        rows = _described(image, found.keypoints, found.frames[:, 0], self.weights)
+        rows = _describe(image, found.keypoints, found.frames[:, 0], self.weights)
         keep = np.asarray(rows.any(axis=1))
         return dataclasses.replace(found, descriptors=unit_rows(rows), codes=None).take(keep)
 
 
-def _kept() -> Path:
+def _find_weights() -> Path:
     import torch
 
     folder = Path(torch.hub.get_dir()) / "checkpoints"
@@ -61,11 +61,11 @@ def _kept() -> Path:
     return kept[0]
 
 
-def _described(image: np.ndarray, keypoints: Floats, diameters: Floats, path: Path) -> Floats:
+def _describe(image: np.ndarray, keypoints: Floats, diameters: Floats, path: Path) -> Floats:
     """(H, W, 3), (N, 2), (N,) -> (N, 128)"""
     import torch
 
-    kornia, network = _network(path, path.stat().st_mtime_ns)
+    kornia, network = _load_network(path, path.stat().st_mtime_ns)
     grey = kornia.color.rgb_to_grayscale(torch.from_numpy(image.transpose(2, 0, 1).copy())[None].float() / 255)  # (1, 1, H, W)
     centres = torch.from_numpy(keypoints - np.float32(0.5))[None]  # kornia's centre of the first pixel is (0, 0)
     scales = torch.from_numpy(diameters * np.float32(RADIUS))[None, :, None, None]
@@ -76,7 +76,7 @@ def _described(image: np.ndarray, keypoints: Floats, diameters: Floats, path: Pa
 
 
 @lru_cache(maxsize=2)
-def _network(path: Path, changed: int) -> tuple[Any, Any]:
+def _load_network(path: Path, changed: int) -> tuple[Any, Any]:
     """kornia, and its network with the weights of a file as it was at that time."""
     import torch
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from bench.api import Extractor
 from bench.core.errors import SampleError, UserError
-from bench.formats.stored_features import in_square, named, upright
+from bench.formats.stored_features import map_into_square, match_name, read_upright_size
 from bench.geometry.nearest_words import unit_rows
 from bench.types import Features, Floats
 
@@ -42,7 +42,7 @@ class Hloc(Extractor):
         _check(source, stored, len(keypoints), self.dimension, size)
         descriptors = stored.T  # (N, D)
         side = image.shape[0]
-        xy = in_square(keypoints + 0.5, size, side)  # (N, 2)
+        xy = map_into_square(keypoints + 0.5, size, side)  # (N, 2)
         keep = ((xy >= 0) & (xy < side)).all(axis=1)
         if not keep.any():
             raise SampleError(f"{source.name}: no keypoint of {self.path} lies in the photograph's central square")
@@ -54,7 +54,7 @@ class Hloc(Extractor):
     def _read(self, source: Path) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
         """-> keypoints (N, 2), descriptors (D, N), and the width and height that they were extracted at"""
         with h5py.File(self.path) as opened:
-            name = named(source, opened)
+            name = match_name(source, opened)
             group = None if name is None else opened[name]
             if group is None:
                 raise SampleError(f"{source.name}: {self.path} has no features of it")
@@ -77,7 +77,7 @@ def _check(source: Path, descriptors: Floats, count: int, dimension: int, size: 
         raise SampleError(f"{source.name}: descriptors hold values that are not finite")
     if not descriptors.any(axis=0).all():
         raise SampleError(f"{source.name}: a descriptor is zero")
-    upright(source, size)
+    read_upright_size(source, size)
 
 
 PLUGIN = Hloc

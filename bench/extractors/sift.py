@@ -44,7 +44,7 @@ class Sift(Extractor):
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         points = sift.detect(grey, None)
         if self.upright:
-            points = _once_each(points)
+            points = _deduplicate(points)
         # Strongest first; equal responses in the order of their positions, so that the cut is reproducible.
         points = sorted(points, key=lambda p: (-p.response, p.pt, p.size, p.angle))[: self.max_keypoints]
         if not points:
@@ -82,7 +82,7 @@ class Sift(Extractor):
         return replace(self, max_keypoints=sys.maxsize)
 
 
-def _once_each(points: list) -> list:
+def _deduplicate(points: list) -> list:
     """Drop the repetitions of a point that differ in orientation only, and fix the orientation."""
     unique = {(point.pt, point.size): point for point in points}
     for point in unique.values():

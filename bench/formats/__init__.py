@@ -1,1 +1,1 @@
-"""Readers and writers of files that other programs share."""
+"""Readers and writers of files that other programs use."""

@@ -1,8 +1,8 @@
-"""VisualSFM's models (NVM_V3): the names and poses of the cameras. Points are not read: they are triangulated anew.
+"""Reads and writes the cameras of VisualSFM's models (NVM_V3). Points are not read: they are triangulated again.
 
 After the header and the number of cameras, each camera is a line `name focal qw qx qy qz cx cy cz distortion 0`: the rotation
-from world to camera, and the camera's centre in the world. The focal length and distortion are not used: Aachen's notes say that
-the intrinsics beside the model are the right ones.
+from world to camera, and the camera's centre in the world. The focal length and distortion are not used: Aachen's notes
+say that the intrinsics beside the model are the right ones.
 """
 
 from __future__ import annotations
@@ -17,40 +17,42 @@ from bench.formats import lists
 
 
 def read(path: Path) -> dict[str, tuple[int, pycolmap.Rigid3d]]:
-    """Name -> the line's number, and camera from world.
+    """Return name -> (line number, camera from world).
 
     Raises
     ------
     UserError
-        if the file or one of its cameras does not fit.
+        if the file or one of its cameras is malformed.
     """
-    rows = lists.lines(path)
+    rows = lists.read_fields(path)
     number, header = next(rows, (1, []))
     if not header or header[0] != "NVM_V3":
         raise UserError(f"{path}:{number}: an NVM model begins with NVM_V3")
     number, count = next(rows, (number, []))
     if len(count) != 1 or not count[0].isdecimal():
         raise UserError(f"{path}:{number}: expected the number of cameras, not {' '.join(count)!r}")
-    found: dict[str, tuple[int, pycolmap.Rigid3d]] = {}
+    poses: dict[str, tuple[int, pycolmap.Rigid3d]] = {}
     for _ in range(int(count[0])):
         number, fields = next(rows, (number, []))
         where = f"{path}:{number}"
         if len(fields) != 11:
-            raise UserError(f"{where}: a camera has 11 fields, but there are {len(fields)}; {count[0]} cameras were announced")
+            raise UserError(
+                f"{where}: a camera has 11 fields, but there are {len(fields)}; the header announces {count[0]} cameras"
+            )
         name = fields[0]
-        if name in found:
-            raise UserError(f"{where}: {name} stands here for the second time; the first is line {found[name][0]}")
-        values = lists.numbers(fields[1:], where)
-        rotation = lists.rotation(values[1:5], where)
-        found[name] = number, pycolmap.Rigid3d(rotation, -(rotation.matrix() @ values[5:8]))
-    return found
+        if name in poses:
+            raise UserError(f"{where}: {name} occurs a second time; the first is line {poses[name][0]}")
+        values = lists.parse_numbers(fields[1:], where)
+        rotation = lists.parse_rotation(values[1:5], where)
+        poses[name] = number, pycolmap.Rigid3d(rotation, -(rotation.matrix() @ values[5:8]))
+    return poses
 
 
 def write(path: Path, images: Mapping[str, tuple[pycolmap.Camera, pycolmap.Rigid3d]]) -> None:
     """Write cameras and poses, without points."""
     rows = ["NVM_V3", "", str(len(images))]
     for name, (camera, pose) in images.items():
-        values = [camera.mean_focal_length(), *lists.quaternion(pose), *pose.inverse().translation]
+        values = [camera.mean_focal_length(), *lists.to_wxyz(pose), *pose.inverse().translation]
         rows.append(f"{name} {' '.join(repr(float(value)) for value in values)} 0 0")
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text("\n".join([*rows, "", "0", ""]), encoding="utf-8")

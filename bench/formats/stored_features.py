@@ -1,6 +1,6 @@
-"""Features that other programs keep in files, of photographs as they are stored: where they lie in the benchmark's square.
+"""Maps keypoints between a photograph as stored and the benchmark's square, for features from other programs.
 
-A photograph's name in such a file is the path below the other program's image folder.
+A photograph's name in such a file is its path below the other program's image folder.
 """
 
 from __future__ import annotations
@@ -16,44 +16,44 @@ from bench.core.errors import SampleError
 ORIENTATION = 0x0112  # the EXIF tag; 1 is upright
 
 
-def in_square(xy: np.ndarray, size: tuple[int, int], side: int) -> np.ndarray:
-    """Move points of an image of `size` (width, height) into its largest centred square, resized to `side`. (N, 2) -> (N, 2)"""
-    return (xy - _corner(size)) * (side / min(size))
+def map_into_square(xy: np.ndarray, size: tuple[int, int], side: int) -> np.ndarray:
+    """Map points of an image of `size` (width, height) to its largest centred square, resized to `side`. (N, 2) -> (N, 2)"""
+    return (xy - _find_corner(size)) * (side / min(size))
 
 
-def out_of_square(xy: np.ndarray, size: tuple[int, int], side: int) -> np.ndarray:
-    """Undo `in_square`. (N, 2) -> (N, 2)"""
-    return xy * (min(size) / side) + _corner(size)
+def map_out_of_square(xy: np.ndarray, size: tuple[int, int], side: int) -> np.ndarray:
+    """Invert `map_into_square`. (N, 2) -> (N, 2)"""
+    return xy * (min(size) / side) + _find_corner(size)
 
 
-def named(source: Path, known: Container[str]) -> str | None:
-    """Of the ends of a photograph's path the longest that is known."""
+def match_name(source: Path, names: Container[str]) -> str | None:
+    """Return the longest end of a photograph's path that is in `names`, None if there is none."""
     parts = source.resolve().parts[1:]
-    names = ("/".join(parts[start:]) for start in range(len(parts)))
-    return next((name for name in names if name in known), None)
+    ends = ("/".join(parts[start:]) for start in range(len(parts)))
+    return next((end for end in ends if end in names), None)
 
 
-def upright(source: Path, size: tuple[int, int] | None = None) -> tuple[int, int]:
-    """The width and height of a photograph as it is stored, which must be `size`, if that is given.
+def read_upright_size(source: Path, size: tuple[int, int] | None = None) -> tuple[int, int]:
+    """Return the width and height of a photograph as stored, and check that they are `size` if given.
 
     Raises
     ------
-    UnitError
-        if it is of another size, or has an EXIF rotation, which features of other programs do not follow.
+    SampleError
+        if it has another size, or an EXIF rotation, which features of other programs ignore.
     """
     try:
         with Image.open(source) as opened:
             if size is not None and opened.size != size:
-                told = f"the features are of an image of {size} pixels, the photograph has {opened.size}"
-                raise SampleError(f"{source.name}: {told}")
+                sizes = f"the features are of an image of {size} pixels, the photograph has {opened.size}"
+                raise SampleError(f"{source.name}: {sizes}")
             if opened.getexif().get(ORIENTATION, 1) != 1:
-                raise SampleError(f"{source.name}: it has an EXIF rotation, which such features do not follow")
+                raise SampleError(f"{source.name}: it has an EXIF rotation, which such features ignore")
             return opened.size
     except OSError as error:
         raise SampleError(f"{source.name}: cannot be read as an image: {error}") from error
 
 
-def _corner(size: tuple[int, int]) -> np.ndarray:
-    """The top left of the square that `photographs.square` cuts out."""
+def _find_corner(size: tuple[int, int]) -> np.ndarray:
+    """Return the top left corner of the square that `photographs.crop_square` crops."""
     short = min(size)
     return np.array([(side - short) // 2 for side in size])

@@ -1,4 +1,4 @@
-"""Safetensors files that carry what they are and a digest of all they hold, verified at every load."""
+"""Safetensors files with a kind, metadata and a digest of their content, verified at every load."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from bench.core.errors import UserError
 Arrays = dict[str, np.ndarray]
 
 
-def content_digest(kind: str, arrays: Arrays, meta: dict[str, Any]) -> str:
-    """SHA-256 over the kind, the metadata and every array's name, dtype, shape and bytes."""
+def hash_content(kind: str, arrays: Arrays, meta: dict[str, Any]) -> str:
+    """Return the SHA-256 of the kind, the metadata and every array's name, dtype, shape and bytes."""
     digest = hashlib.sha256(json.dumps([kind, meta], sort_keys=True, allow_nan=False).encode())
     for name in sorted(arrays):
         array = np.ascontiguousarray(arrays[name])
@@ -25,22 +25,22 @@ def content_digest(kind: str, arrays: Arrays, meta: dict[str, Any]) -> str:
     return "sha256:" + digest.hexdigest()
 
 
-def halved(array: np.ndarray) -> np.ndarray:
-    """In half precision, or as it is where that has no such numbers: a batch norm's variance may well be above 65,504."""
+def to_half(array: np.ndarray) -> np.ndarray:
+    """Convert to half precision, unless a value overflows: a batch norm's variance may be above 65,504."""
     with np.errstate(over="ignore"):
         half = array.astype(np.float16)
     return half if np.isfinite(half).all() else array
 
 
 def save(path: Path, kind: str, arrays: Arrays, meta: dict[str, Any]) -> str:
-    """Write the file in one step (a crash leaves the old one) and return its digest."""
-    from safetensors.numpy import save as serialized
+    """Write the file atomically (a crash leaves the old one) and return its digest."""
+    from safetensors.numpy import save as serialize
 
-    digest = content_digest(kind, arrays, meta)
+    digest = hash_content(kind, arrays, meta)
     path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f"{path.name}.{os.getpid()}.unfinished")  # others may be writing the same
+    unfinished = path.with_name(f"{path.name}.{os.getpid()}.unfinished")  # another process may be writing the same file
     header = {"kind": kind, "digest": digest, "meta": json.dumps(meta, sort_keys=True, allow_nan=False)}
-    content = serialized({name: np.ascontiguousarray(array) for name, array in arrays.items()}, header)
+    content = serialize({name: np.ascontiguousarray(array) for name, array in arrays.items()}, header)
     try:
         unfinished.write_bytes(content)
         unfinished.replace(path)
@@ -56,26 +56,26 @@ def load(path: Path, kind: str) -> tuple[Arrays, dict[str, Any], str]:
     Raises
     ------
     UserError
-        if there is no such file, it is of another kind, or its content is not what was written.
+        if there is no such file, it is of another kind, or its digest is wrong.
     """
     arrays, header = _read(path)
     if header.get("kind") != kind:
         raise UserError(f"{path}: holds {header.get('kind', 'something else')!s}, not {kind}")
-    return arrays, *_checked(path, arrays, header)
+    return arrays, *_check_digest(path, arrays, header)
 
 
 def verify(path: Path) -> None:
-    """Read a file of whatever kind.
+    """Check the digest of a file of any kind.
 
     Raises
     ------
     UserError
-        if there is no such file, or its content is not what was written.
+        if there is no such file, or its digest is wrong.
     """
     arrays, header = _read(path)
     if not {"kind", "digest", "meta"} <= header.keys():
         raise UserError(f"{path}: has no checksum")
-    _checked(path, arrays, header)
+    _check_digest(path, arrays, header)
 
 
 def _read(path: Path) -> tuple[Arrays, dict[str, str]]:
@@ -88,13 +88,13 @@ def _read(path: Path) -> tuple[Arrays, dict[str, str]]:
             header = opened.metadata() or {}
             return {name: opened.get_tensor(name) for name in opened.keys()}, header  # noqa: SIM118 (it is no mapping)
     except (SafetensorError, OSError) as error:
-        raise UserError(f"{path}: not a whole safetensors file: {error}") from error
+        raise UserError(f"{path}: not a complete safetensors file: {error}") from error
 
 
-def _checked(path: Path, arrays: Arrays, header: dict[str, str]) -> tuple[dict[str, Any], str]:
-    """The metadata and the digest."""
+def _check_digest(path: Path, arrays: Arrays, header: dict[str, str]) -> tuple[dict[str, Any], str]:
+    """Return the metadata and the digest."""
     meta = json.loads(header["meta"])
-    digest = content_digest(header["kind"], arrays, meta)
+    digest = hash_content(header["kind"], arrays, meta)
     if digest != header.get("digest"):
         raise UserError(f"{path}: its checksum is {digest}, but {header.get('digest')} was written; fetch or build it again")
     return meta, digest

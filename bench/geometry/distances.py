@@ -1,6 +1,6 @@
-"""Squared distances of all pairs of points and affine subspaces, and which pairs are mutually nearest.
+"""Squared distances of all pairs of points and affine subspaces, and mutual nearest neighbours.
 
-In float32: of points and subspaces of unit norm they are off by about 1e-6, of two subspaces by about 2e-5.
+In float32. The error is about 1e-6 for points of unit norm and subspaces, and about 2e-5 for two subspaces.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from bench.types import Indices, Subspaces
 
 
 def points_to_points(one: Tensor, other: Tensor) -> Tensor:
-    """Of unit vectors. (N, D), (R, D) -> (N, R)"""
+    """Squared distances of unit vectors. (N, D), (R, D) -> (N, R)"""
     return (2 - 2 * (one @ other.T)).clamp_(min=0)
 
 
 def subspaces_to_points(release: Subspaces, points: Tensor) -> Tensor:
-    """Of subspaces and unit vectors u: 1 + |p|² − 2 p·u − |B u|², where p is the subspace's point nearest to zero.
+    """Squared distances of subspaces and unit vectors u. (R, D) -> (N, R)
 
-    (R, D) -> (N, R)
+    1 + |p|² − 2 p·u − |B u|², where p is the subspace's point nearest to zero.
     """
     feet, frames = feet_and_frames(release)
     planes = torch.from_numpy(np.concatenate([feet[:, None], frames], axis=1).transpose(1, 0, 2).astype(np.float32, order="C"))
@@ -35,20 +35,20 @@ def subspaces_to_points(release: Subspaces, points: Tensor) -> Tensor:
 
 
 def subspaces_to_subspaces(one: Subspaces, other: Subspaces) -> Tensor:
-    """(N, N')"""
-    found = torch.empty(len(one), len(other), device=pick_device())
+    """Squared distances of subspaces. -> (N, N')"""
+    squared = torch.empty(len(one), len(other), device=pick_device())
     for top, left, block in squared_distances(one, other, directions=one.origins.shape[1]):
-        found[top : top + block.shape[0], left : left + block.shape[1]] = block
-    return found.clamp_(min=0)
+        squared[top : top + block.shape[0], left : left + block.shape[1]] = block
+    return squared.clamp_(min=0)
 
 
-def mutual(squared: Tensor, ratio: float = 1.0) -> tuple[Indices, Indices]:
-    """Rows and columns that are each other's nearest, ties to the lowest index.
+def find_mutual_nearest(squared: Tensor, ratio: float = 1.0) -> tuple[Indices, Indices]:
+    """Return the pairs of a row and a column that are each other's nearest, ties to the lowest index.
 
     Parameters
     ----------
     squared : (N, R) squared distances
-    ratio : a row's nearest must be closer than this times its second nearest (Lowe, IJCV 2004); 1 asks for nothing
+    ratio : a row's nearest must be closer than this times its second nearest (Lowe, IJCV 2004); 1 disables the test
 
     Returns
     -------
@@ -57,9 +57,9 @@ def mutual(squared: Tensor, ratio: float = 1.0) -> tuple[Indices, Indices]:
     if squared.numel() == 0:
         return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
     columns = squared.argmin(dim=1)  # (N,)
-    kept = squared.argmin(dim=0)[columns] == torch.arange(len(squared), device=squared.device)
+    mutual = squared.argmin(dim=0)[columns] == torch.arange(len(squared), device=squared.device)
     if ratio < 1 and squared.shape[1] > 1:
         nearest, second = squared.topk(2, dim=1, largest=False).values.T
-        kept &= nearest < ratio**2 * second
-    rows = kept.nonzero()[:, 0]
+        mutual &= nearest < ratio**2 * second
+    rows = mutual.nonzero()[:, 0]
     return rows.cpu().numpy(), columns[rows].cpu().numpy()

@@ -1,9 +1,9 @@
 """Points of affine subspaces that are multiples of an integer vector, by lattice reduction (Lenstra, Lenstra, Lovász 1982).
 
 The linear span L of an affine subspace D has k = dim + 1 dimensions, and a random direction in it has no integer vector of
-moderate length. Given L to a part in 10^6, those that there are can be found. k components y of x in L fix the others, x = M
+moderate length. Given L to a part in 10^6, the existing ones can be found. k components y of x in L determine the others, x = M
 y. The rows of [I, λ M'], [0, λ I], with M' e rows of M, span a lattice in which the integer vectors of L are the short ones:
-about |x|, where chance gives λ^(e / (k + e)).
+about |x|, where a random lattice has λ^(e / (k + e)).
 
 Such an x = f y, with y in D and f linear on L, is a multiple of a unit vector of D if |x| = f. All such x up to a length are
 enumerated (Fincke, Pohst 1985). In the form |x|² - β f², with β their mean cosine, they are nearly orthogonal: a basis that
@@ -19,7 +19,7 @@ from flint import fmpz_mat
 from numpy.typing import NDArray
 
 from bench.geometry.nearest_words import unit_rows
-from bench.geometry.pivoting import independent_rows
+from bench.geometry.pivoting import select_independent_rows
 from bench.types import Floats, Indices, Subspaces
 
 Doubles = NDArray[np.float64]
@@ -27,22 +27,22 @@ Integers = NDArray[np.int64]
 
 BATCH = 256  # subspaces at a time
 WEIGHT = 1e6  # λ: float32 leaves errors of 1e-6 to 5e-5 in an integer vector's components
-INTEGRAL = 0.01  # a component this near to an integer is one
-MARGIN = 2.0  # by which chance's vectors shall be longer
-SLACK = 1.25  # a basis may need vectors longer than those that are sought
-ROUNDS = 4  # reductions, each with the components that the last left fractional
-FINENESS = 64.0  # of the grid that bases are rounded to; roundings add up over k components of up to 255
+INTEGRAL = 0.01  # a component this near to an integer counts as one
+MARGIN = 2.0  # factor by which random short vectors must be longer
+SLACK = 1.25  # a basis may need longer vectors than the searched ones
+ROUNDS = 4  # reductions, each with the components that stayed fractional in the previous one
+FINENESS = 64.0  # of the rounding grid of bases; rounding errors add up over k components of up to 255
 DEFINITE = 0.999  # of the greatest β for which |x|² - β f² is positive
 ON_SPHERE = 1e-6  # of ||x| - f| / |x|; float32 leaves 1e-7
-MOST = 1e6  # expected number of short vectors above which a lattice is given up
+MAX_SHORT_VECTORS = 1e6  # expected number of short vectors above which a lattice is skipped
 
 
-def unit_integer_points(release: Subspaces, longest: float) -> tuple[Indices, Floats]:
-    """All points of each subspace that are nowhere negative, of unit norm, and a multiple of an integer vector.
+def find_unit_integer_points(release: Subspaces, longest: float) -> tuple[Indices, Floats]:
+    """Return all points of each subspace that are non-negative, of unit norm, and a multiple of an integer vector.
 
     Parameters
     ----------
-    release : of float32 in full; half precision is not enough for WEIGHT
+    release : in float32; half precision is not enough for WEIGHT
     longest : greatest norm of the integer vectors
 
     Returns
@@ -56,46 +56,46 @@ def unit_integer_points(release: Subspaces, longest: float) -> tuple[Indices, Fl
         columns = np.concatenate([release.bases[block].transpose(0, 2, 1), release.origins[block, :, None]], axis=2)
         spans, triangles = np.linalg.qr(columns.astype(np.float64))  # (b, D, dim + 1)
         levels = spans[:, :, -1] / triangles[:, -1, -1:]  # (b, D) f
-        lattices = integer_vectors(spans, longest)
+        lattices = find_integer_vectors(spans, longest)
         ranks = np.array([len(basis) for basis in lattices])
         for rank in np.unique(ranks[ranks > 0]):
             members = np.flatnonzero(ranks == rank)
-            owner, x = _on_sphere(np.stack([lattices[i] for i in members]).astype(np.float64), levels[members], longest)
+            owner, x = _select_on_sphere(np.stack([lattices[i] for i in members]).astype(np.float64), levels[members], longest)
             owners.append(members[owner] + start)
             rows.append(unit_rows(x.astype(np.float32)))
     return np.concatenate(owners), np.concatenate(rows)
 
 
-def integer_vectors(spans: Doubles, longest: float) -> list[Integers]:
-    """Bases of the lattices of integer vectors in linear subspaces. (N, D, k) orthonormal columns -> N arrays (q, D), q <= k
+def find_integer_vectors(spans: Doubles, longest: float) -> list[Integers]:
+    """Find bases of the integer vectors in linear subspaces. (N, D, k) orthonormal columns -> N arrays (q, D), q <= k
 
     A basis is complete if its vectors need not be longer than SLACK · longest. Each subspace is one call of FLINT: 0.03 ms at
     k = 3, 6 ms at k = 17.
     """
     length, k = spans.shape[1:]
-    free = independent_rows(spans)  # (N, k)
+    free = select_independent_rows(spans)  # (N, k)
     inverse = np.linalg.inv(np.take_along_axis(spans, free[:, :, None], axis=1))  # (N, k, k)
     maps = spans @ inverse  # (N, D, k) M
     leverage = np.square(maps).sum(axis=2)  # (N, D)
     np.put_along_axis(leverage, free, -1.0, axis=1)
-    # Of n components, an integer vector is about longest √(n / D), and the shortest by chance √(n / 2πe) λ^(e / n).
+    # In n components, an integer vector has about longest √(n / D), the shortest random vector √(n / 2πe) λ^(e / n).
     chance = math.log(MARGIN * longest * math.sqrt(2 * math.pi * math.e / length))
     extra = min(length - k, math.ceil(k * chance / (math.log(WEIGHT) - chance)) + 1)
-    telling = np.argsort(-leverage, axis=1)[:, :extra]  # (N, e) a component that hardly depends on y tells little
-    return [_integral(m, rows, longest) for m, rows in zip(maps, telling, strict=True)]
+    informative = np.argsort(-leverage, axis=1)[:, :extra]  # (N, e) components that depend most on y
+    return [_solve_integer_lattice(m, rows, longest) for m, rows in zip(maps, informative, strict=True)]
 
 
-def short_vectors(grams: Doubles, bounds: Doubles) -> tuple[Indices, Integers]:
-    """All integer c with cᵀ G c <= bound, of many lattices at once.
+def enumerate_short_vectors(grams: Doubles, bounds: Doubles) -> tuple[Indices, Integers]:
+    """Return all integer c with cᵀ G c <= bound, for many lattices.
 
     Parameters
     ----------
-    grams : (N, q, q) positive definite, of LLL-reduced bases if it is to be quick
+    grams : (N, q, q) positive definite; the search is fast for LLL-reduced bases
     bounds : (N,)
 
     Returns
     -------
-    (n,) the lattice of each, and (n, q) its coefficients; zero and both signs are among them.
+    (n,) the lattice of each, and (n, q) its coefficients; zero and both signs are included.
     """
     lower = np.linalg.cholesky(grams)  # (N, q, q): cᵀ G c = Σ_i (L_ii c_i + Σ_{j > i} L_ji c_j)²
     count, q = grams.shape[:2]
@@ -117,41 +117,41 @@ def short_vectors(grams: Doubles, bounds: Doubles) -> tuple[Indices, Integers]:
     return owners, coefficients
 
 
-def reduced(basis: Doubles) -> Doubles:
+def reduce_basis(basis: Doubles) -> Doubles:
     """LLL-reduce the rows of a basis, rounded to multiples of 1 / FINENESS. (n, c) -> (n, c)"""
     rows, columns = basis.shape
     short = fmpz_mat(rows, columns, np.rint(FINENESS * basis).astype(np.int64).ravel().tolist()).lll()
     return np.array([float(entry) for entry in short.entries()]).reshape(basis.shape) / FINENESS
 
 
-def _integral(m: Doubles, rows: Indices, longest: float) -> Integers:
-    """The integer vectors x = M y of one subspace. (D, k), (e,) -> (q, D)"""
+def _solve_integer_lattice(m: Doubles, rows: Indices, longest: float) -> Integers:
+    """Return a basis of the integer vectors x = M y of one subspace. (D, k), (e,) -> (q, D)"""
     y = np.eye(m.shape[1])
     for _ in range(ROUNDS):
-        y = _short(y, m[rows], SLACK * longest)
+        y = _reduce_to_short(y, m[rows], SLACK * longest)
         x = y @ m.T  # (r, D)
         off = np.abs(x - np.rint(x))
         if off.max(initial=0.0) < INTEGRAL:
             return np.rint(x).astype(np.int64)
-        # Some are whole only where that was asked for, such as an integer vector divided by what those components have in common.
+        # Some vectors are integral only in the selected components, such as one divided by a common factor of those.
         rows = np.argsort(-off.max(axis=0))[: len(y) + 1]
     return np.empty((0, len(m)), dtype=np.int64)
 
 
-def _short(y: Doubles, m: Doubles, bound: float) -> Doubles:
-    """Of the lattice that y spans, a basis of what makes M y nearly whole and is no longer than the bound. (r, k), (e, k)"""
+def _reduce_to_short(y: Doubles, m: Doubles, bound: float) -> Doubles:
+    """Reduce the lattice spanned by y to vectors where M y is nearly integral and no longer than the bound. (r, k), (e, k)"""
     (r, k), e = y.shape, len(m)
     basis = np.zeros((r + e, k + e))
     basis[:r, :k], basis[:r, k:], basis[r:, k:] = y, WEIGHT * (y @ m.T), WEIGHT * np.eye(e)
-    short = reduced(basis)  # (r + e, k + e)
-    found = short[np.linalg.norm(short, axis=1) <= bound, :k]
-    return found[found.any(axis=1)]
+    short = reduce_basis(basis)  # (r + e, k + e)
+    vectors = short[np.linalg.norm(short, axis=1) <= bound, :k]
+    return vectors[vectors.any(axis=1)]
 
 
-def _on_sphere(bases: Doubles, levels: Doubles, longest: float) -> tuple[Indices, Doubles]:
-    """Integer combinations that are nowhere negative and multiples of unit vectors of D.
+def _select_on_sphere(bases: Doubles, levels: Doubles, longest: float) -> tuple[Indices, Doubles]:
+    """Return the integer combinations that are non-negative and multiples of unit vectors of D.
 
-    (n, q, D), (n, D) -> (c,) which of the n, and (c, D)
+    (n, q, D), (n, D) -> (c,) indices into n, and (c, D)
     """
     rank = bases.shape[1]
     f = np.einsum("nqd,nd->nq", bases, levels)
@@ -160,12 +160,12 @@ def _on_sphere(bases: Doubles, levels: Doubles, longest: float) -> tuple[Indices
     near = 1 / np.einsum("nq,nq->n", f, np.linalg.solve(grams, f[:, :, None])[:, :, 0])
     beta = np.clip(near - (1 - near) / max(rank - 1, 1), 0.0, DEFINITE * np.minimum(near, 1.0))
     forms = grams - beta[:, None, None] * f[:, :, None] * f[:, None, :]
-    change = np.stack([_reduction(form) for form in forms])  # (n, q, q)
+    change = np.stack([_reduce_form(form) for form in forms])  # (n, q, q)
     bases, f = change @ bases, np.einsum("npq,nq->np", change, f)
     forms = change @ forms @ change.transpose(0, 2, 1)
     bounds = (1 - beta) * longest**2
-    few = np.flatnonzero(_expected(forms, bounds) <= MOST)
-    owner, coefficients = short_vectors(forms[few], bounds[few])
+    few = np.flatnonzero(_estimate_count(forms, bounds) <= MAX_SHORT_VECTORS)
+    owner, coefficients = enumerate_short_vectors(forms[few], bounds[few])
     owner = few[owner]
     x = np.einsum("cq,cqd->cd", coefficients.astype(np.float64), bases[owner])
     level = np.einsum("cq,cq->c", coefficients.astype(np.float64), f[owner])
@@ -174,14 +174,14 @@ def _on_sphere(bases: Doubles, levels: Doubles, longest: float) -> tuple[Indices
     return owner[good], x[good]
 
 
-def _reduction(form: Doubles) -> Doubles:
-    """The change of basis that reduces a positive definite form. (q, q) -> (q, q)"""
+def _reduce_form(form: Doubles) -> Doubles:
+    """Return the change of basis that reduces a positive definite form. (q, q) -> (q, q)"""
     rank = len(form)
-    return reduced(np.concatenate([np.linalg.cholesky(form), np.eye(rank)], axis=1))[:, rank:]
+    return reduce_basis(np.concatenate([np.linalg.cholesky(form), np.eye(rank)], axis=1))[:, rank:]
 
 
-def _expected(forms: Doubles, bounds: Doubles) -> Doubles:
-    """The number of vectors within `bounds`: the ball's volume over that of a cell. (n, q, q), (n,) -> (n,)"""
+def _estimate_count(forms: Doubles, bounds: Doubles) -> Doubles:
+    """Estimate the number of vectors within `bounds`: the ball's volume over that of a lattice cell. (n, q, q), (n,) -> (n,)"""
     rank = forms.shape[1]
     ball = rank / 2 * math.log(math.pi) - math.lgamma(rank / 2 + 1)
     return np.exp(ball + rank / 2 * np.log(bounds) - np.linalg.slogdet(forms)[1] / 2)

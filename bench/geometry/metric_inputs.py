@@ -1,4 +1,4 @@
-"""What every metric asks of its two arguments, checked in one place."""
+"""Validation of the two arguments of every metric."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from bench.types import Floats
 Doubles = NDArray[np.float64]
 
 
-def image_pair(truth: Floats, estimate: Floats) -> tuple[Doubles, Doubles]:
-    """Two (H, W, 3) images in [0, 1], in float64.
+def validate_images(truth: Floats, estimate: Floats) -> tuple[Doubles, Doubles]:
+    """Return two (H, W, 3) images in [0, 1] as float64.
 
     Raises
     ------
     ValueError
         if they are anything else.
     """
-    _same_shape(truth, estimate)
+    _check_same_shape(truth, estimate)
     if truth.ndim != 3 or truth.shape[2] != 3:
         raise ValueError(f"images must be (H, W, 3), got {truth.shape}")
     for name, image in (("truth", truth), ("estimate", estimate)):
@@ -27,15 +27,15 @@ def image_pair(truth: Floats, estimate: Floats) -> tuple[Doubles, Doubles]:
     return truth.astype(np.float64), estimate.astype(np.float64)
 
 
-def descriptor_pair(truth: Floats, estimate: Floats) -> tuple[Doubles, Doubles]:
-    """Two (N, D) arrays of descriptors, N at least 1, in float64.
+def validate_descriptors(truth: Floats, estimate: Floats) -> tuple[Doubles, Doubles]:
+    """Return two (N, D) arrays of descriptors, N at least 1, as float64.
 
     Raises
     ------
     ValueError
         if they are anything else, or hold a NaN or an infinity.
     """
-    _same_shape(truth, estimate)
+    _check_same_shape(truth, estimate)
     if truth.ndim != 2 or len(truth) == 0:
         raise ValueError(f"descriptors must be (N, D) with N at least 1, got {truth.shape}")
     for name, rows in (("truth", truth), ("estimate", estimate)):
@@ -44,12 +44,12 @@ def descriptor_pair(truth: Floats, estimate: Floats) -> tuple[Doubles, Doubles]:
     return truth.astype(np.float64), estimate.astype(np.float64)
 
 
-def directions(rows: Doubles) -> Doubles:
+def normalize_rows(rows: Doubles) -> Doubles:
     """Scale each row to unit norm; a row of zeros stays zero. (N, D) -> (N, D)"""
     norms = np.linalg.norm(rows, axis=1, keepdims=True)
     return rows / np.where(norms > 0, norms, 1.0)
 
 
-def _same_shape(truth: Floats, estimate: Floats) -> None:
+def _check_same_shape(truth: Floats, estimate: Floats) -> None:
     if truth.shape != estimate.shape:
         raise ValueError(f"truth and estimate differ in shape: {truth.shape} and {estimate.shape}")

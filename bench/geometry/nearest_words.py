@@ -1,4 +1,4 @@
-"""Exact search for the word of greatest cosine: a bf16 pass finds which words it can be, float64 decides among them.
+"""Exact search for the word of greatest cosine: a bf16 pass finds the candidates, float64 decides among them.
 
 Floor: 2·N·K·D operations at the machine's bf16 matrix rate; the words are read once for each batch of queries.
 """
@@ -15,7 +15,7 @@ from bench.core.device import pick_device, pick_dtype
 from bench.types import Bytes, Floats, Indices
 
 BLOCK = 2048  # words in a block: a block and its scores stay in the cache
-BATCH = 512  # queries that share one reading of the words
+BATCH = 512  # queries per pass over the words
 
 SLACK = 1e-4  # for sums in float32 and for products of errors
 
@@ -28,7 +28,7 @@ def unit_rows(rows: Bytes | Floats) -> Floats:
 
 
 class WordIndex:
-    """(K, D) uint8 words, none zero, made ready to be searched."""
+    """A search index of (K, D) uint8 words, none zero."""
 
     def __init__(self, words: Bytes) -> None:
         device = pick_device()
@@ -38,7 +38,7 @@ class WordIndex:
         self._coarse = exact.to(device, self._dtype)  # (K, D)
         self._error = float(rounding(exact, self._coarse).max())
 
-    def nearest(self, queries: Bytes | Floats, progress: Callable[[int], object] = lambda done: None) -> Indices:
+    def find_nearest(self, queries: Bytes | Floats, progress: Callable[[int], object] = lambda done: None) -> Indices:
         """Return for each query the index of the word of greatest cosine, ties to the lowest index.
 
         Parameters
@@ -55,12 +55,14 @@ class WordIndex:
             batch = queries[start : start + BATCH]
             exact = torch.from_numpy(unit_rows(batch))
             coarse = exact.to(self._coarse.device, self._dtype)
-            found[start : start + BATCH] = self._decide(batch, *self._possible(coarse, rounding(exact, coarse) + self._error))
+            found[start : start + BATCH] = self._decide(
+                batch, *self._find_candidates(coarse, rounding(exact, coarse) + self._error)
+            )
             progress(len(batch))
         return found
 
-    def _possible(self, queries: Tensor, errors: Tensor) -> tuple[np.ndarray, np.ndarray]:
-        """Pairs of a query and a word that may be its nearest. (n, D), (n,) of rounded factors -> (P,), (P,)"""
+    def _find_candidates(self, queries: Tensor, errors: Tensor) -> tuple[np.ndarray, np.ndarray]:
+        """Find the pairs of a query and a word that may be its nearest. (n, D), (n,) rounding errors -> (P,), (P,)"""
         blocks = self._coarse.split(BLOCK)
         tops = torch.stack([block_maxima(queries, block) for block in blocks], dim=1).float()  # (n, blocks)
         best = tops.amax(dim=1)
@@ -75,7 +77,7 @@ class WordIndex:
         return torch.cat(rows).cpu().numpy(), torch.cat(words).cpu().numpy()
 
     def _decide(self, queries: Bytes | Floats, rows: np.ndarray, words: np.ndarray) -> np.ndarray:
-        """Of the possible words of each query the one of greatest cosine. (n, D), (P,), (P,) -> (n,)"""
+        """Select among the candidates of each query the word of greatest cosine. (n, D), (P,), (P,) -> (n,)"""
         exact = self._words[words].astype(np.float64)  # (P, D)
         dots = np.einsum("pd,pd->p", queries[rows].astype(np.float64), exact)
         # Words of one direction must compare equal: the squares of integers divide to one and the same double.
@@ -86,12 +88,12 @@ class WordIndex:
 
 
 def rounding(exact: Tensor, coarse: Tensor) -> Tensor:
-    """How far each row was moved. (n, D), (n, D) -> (n,) on the device of the second"""
+    """Rounding error of each row. (n, D), (n, D) -> (n,) on the device of the second"""
     return (coarse.float() - exact.to(coarse.device)).norm(dim=1)
 
 
 def margin(best: Tensor, errors: Tensor, dtype: torch.dtype) -> Tensor:
-    """How far below the greatest approximate cosine that of the nearest word can be. (n,), (n,) -> (n,)
+    """Greatest deficit of the nearest word's approximate cosine below the greatest one. (n,), (n,) -> (n,)
 
     By Cauchy-Schwarz a cosine is off by at most the sum of the distances that its unit rows were moved, and then by half a unit
     in the last place as it is rounded itself: a quarter of the type's `eps` below one, half of it above. Two are compared.

@@ -1,4 +1,4 @@
-"""Rows of a matrix that are far from dependent, by Gram-Schmidt with pivoting, for many matrices at once."""
+"""Selection of well-conditioned rows by Gram-Schmidt with pivoting, for a batch of matrices."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-def independent_rows(matrices: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Choose k rows of each (D, k) matrix, each the one farthest from the span of those before it. (N, D, k) -> (N, k)"""
+def select_independent_rows(matrices: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Select k rows of each (D, k) matrix, each the one farthest from the span of those before it. (N, D, k) -> (N, k)"""
     count, _, k = matrices.shape
     rest = matrices.copy()
-    chosen = np.empty((count, k), dtype=np.int64)
+    selection = np.empty((count, k), dtype=np.int64)
     for i in range(k):
-        chosen[:, i] = np.square(rest).sum(axis=2).argmax(axis=1)
-        pivot = np.take_along_axis(rest, chosen[:, i, None, None], axis=1)  # (N, 1, k)
+        selection[:, i] = np.square(rest).sum(axis=2).argmax(axis=1)
+        pivot = np.take_along_axis(rest, selection[:, i, None, None], axis=1)  # (N, 1, k)
         pivot /= np.linalg.norm(pivot, axis=2, keepdims=True)
         rest -= (rest @ pivot.transpose(0, 2, 1)) * pivot
-    return chosen
+    return selection

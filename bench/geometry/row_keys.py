@@ -1,4 +1,4 @@
-"""Keys of rows, so that equal rows can be found."""
+"""Hash keys of rows, to find equal rows."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from bench.types import Bytes, Floats
 
 
-def row_keys(rows: Bytes | Floats) -> NDArray[np.uint64]:
-    """A 64-bit key of each row, the same wherever it stands; among 10 million rows two agree with chance 3e-6. (..., D) -> (...,)
+def hash_rows(rows: Bytes | Floats) -> NDArray[np.uint64]:
+    """Return a 64-bit key of each row. Among 10 million different rows two keys agree with chance 3e-6. (..., D) -> (...,)
 
     Rows are compared bit by bit; they have a multiple of 8 bytes.
     """

@@ -1,7 +1,7 @@
-"""Which releases share the words that a release's subspaces go through, and where its subspaces meet theirs.
+"""Finds releases that share a release's sub-database, and the intersections of its subspaces with theirs.
 
-The adversarial words of a photograph come from one of n sub-databases. So one in n of all others can meet it, and that one does
-often: N N' a² / S times, for N and N' subspaces through a words each, of S. A sample of each release tells.
+The adversarial words of a photograph come from one of n sub-databases, so one release in n shares it. Two that share it intersect
+about N N' a² / S times, for N and N' subspaces through a words each, of S words. A sample of each release decides.
 """
 
 from __future__ import annotations
@@ -13,94 +13,100 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bench.geometry.intersections import Doubles, Meetings, joined, meetings, meetings_within
-from bench.types import Subspaces
+from bench.geometry.intersections import (
+    Doubles,
+    SubspaceIntersections,
+    concatenate_intersections,
+    find_intersections,
+    find_intersections_within,
+)
+from bench.types import Points, Subspaces
 
-BATCH = 16  # releases that are looked at together
-TELLING = 8.0  # meetings with the sample of a release that shares, on average: one in 3,000 has none
-PAIRS = 1024  # meetings that are measured at a time
-APART = 1e-5  # points whose images on a line are nearer than this are one
+BATCH = 16  # releases per batch
+SAMPLE_INTERSECTIONS = 8.0  # expected number with the sample of a sharing release: one in 3,000 has none
+PAIRS = 1024  # intersections measured at a time
+EQUAL_TOLERANCE = 1e-5  # points whose images on a line are nearer count as one
 
 
 @dataclass(frozen=True, eq=False)
-class Company:
-    """The subspaces that share a target's sub-database, and where the target's own meet them."""
+class SharedSubDatabase:
+    """The subspaces that share a target's sub-database, and their intersections with the target's subspaces."""
 
-    subspaces: Subspaces  # the target's first, then those of the releases that share
-    meetings: Meetings  # of the target's subspaces (`first`) with others of these (`second`); two of its own stand there twice
-    asked: int  # other releases that were looked at
-    kept: int  # of these, those that share
-    coverage: float  # share of the words in the target's subspaces that another of these goes through, too
+    subspaces: Subspaces  # of the target, then of the sharing releases
+    intersections: SubspaceIntersections  # of the target's subspaces (`first`) with any of these (`second`); its own pairs twice
+    searched: int  # other releases searched
+    sharing: int  # of these, the ones that share the sub-database
+    coverage: float  # fraction of the words in the target's subspaces that another of these contains
 
     def summary(self) -> str:
-        return f"coverage {self.coverage:.3f}: {self.kept} of {self.asked} other releases share the sub-database"
+        return f"coverage {self.coverage:.3f}: {self.sharing} of {self.searched} other releases share the sub-database"
 
 
-def company(target: Subspaces, others: Iterator[Subspaces], words: int, enough: float) -> Company:
-    """Look at other releases until `enough` of the words in the target's subspaces have been met, or there are no more.
+def find_shared_sub_database(target: Subspaces, others: Iterator[Subspaces], words: int, enough: float) -> SharedSubDatabase:
+    """Search other releases until the intersections cover a fraction `enough` of the words in the target's subspaces.
 
     Parameters
     ----------
-    others : made by the same defense
-    words : that a subspace goes through
-    enough : share, from 0 to 1
+    others : releases of the same defense
+    words : per subspace
+    enough : from 0 to 1
     """
-    own = meetings_within(target)
-    met = [own, replace(own, first=own.second, second=own.first)]
-    parts, asked, size = [target], 0, len(target)
+    own = find_intersections_within(target)
+    intersections = [own, replace(own, first=own.second, second=own.first)]
+    parts, searched, size = [target], 0, len(target)
     pairs, found = len(target) * (len(target) - 1) // 2, len(own)
-    while (coverage := _coverage(joined(met), words * len(target))) < enough:
+    while (coverage := _compute_coverage(concatenate_intersections(intersections), words * len(target))) < enough:
         batch = list(itertools.islice(others, BATCH))
         if not batch:
             break
-        asked += len(batch)
-        for part in _sharing(target, batch, found / max(pairs, 1)):
-            more = meetings(target, part)
-            met.append(replace(more, second=more.second + size))
+        searched += len(batch)
+        for part in _select_sharing(target, batch, found / max(pairs, 1)):
+            more = find_intersections(target, part)
+            intersections.append(replace(more, second=more.second + size))
             parts.append(part)
             size += len(part)
             pairs, found = pairs + len(target) * len(part), found + len(more)
-    return Company(stacked(parts), joined(met), asked, len(parts) - 1, coverage)
+    return SharedSubDatabase(stack_subspaces(parts), concatenate_intersections(intersections), searched, len(parts) - 1, coverage)
 
 
-def stacked(releases: Sequence[Subspaces]) -> Subspaces:
-    """The subspaces of at least one release, one after the other."""
+def stack_subspaces(releases: Sequence[Subspaces]) -> Subspaces:
+    """Concatenate the subspaces of one or more releases."""
     return replace(
         releases[0],
-        keypoints=np.concatenate([release.keypoints for release in releases]),
+        positions=Points(keypoints=np.concatenate([release.keypoints for release in releases])),
         origins=np.concatenate([release.origins for release in releases]),
         bases=np.concatenate([release.bases for release in releases]),
     )
 
 
-def _sharing(target: Subspaces, releases: Sequence[Subspaces], chance: float) -> list[Subspaces]:
-    """Those of the releases of which a sample meets the target, where `chance` is that of two subspaces that share."""
-    # Any rows will do: words are drawn for each keypoint afresh.
-    size = math.ceil(TELLING / (chance * len(target))) if chance else max(map(len, releases))
+def _select_sharing(target: Subspaces, releases: Sequence[Subspaces], chance: float) -> list[Subspaces]:
+    """Select the releases with a sample that intersects the target; `chance` is that of two subspaces of a shared one."""
+    # Any rows will do: words are drawn independently for each keypoint.
+    size = math.ceil(SAMPLE_INTERSECTIONS / (chance * len(target))) if chance else max(map(len, releases))
     samples = [release.take(np.arange(min(size, len(release)))) for release in releases]
     owners = np.repeat(np.arange(len(releases)), [len(sample) for sample in samples])
-    hits = np.bincount(owners[meetings(target, stacked(samples)).second], minlength=len(releases))
+    hits = np.bincount(owners[find_intersections(target, stack_subspaces(samples)).second], minlength=len(releases))
     return [release for release, hit in zip(releases, hits, strict=True) if hit]
 
 
-def _coverage(met: Meetings, words: int) -> float:
-    """Share of `words` words in the subspaces of `first` at which there is a meeting; several at one word count once."""
-    certain = met.take(met.single)
-    line = np.random.default_rng(0).normal(size=certain.points.shape[1])
-    images = certain.points @ line
-    order = np.lexsort((images, certain.first))
-    again = (np.diff(certain.first[order]) == 0) & (np.diff(images[order]) < APART)
-    return (len(certain) - int(again.sum())) / words
+def _compute_coverage(intersections: SubspaceIntersections, words: int) -> float:
+    """Fraction of the `words` words of the `first` subspaces with an intersection; several at one word count once."""
+    points = intersections.take(intersections.single)
+    line = np.random.default_rng(0).normal(size=points.points.shape[1])
+    images = points.points @ line
+    order = np.lexsort((images, points.first))
+    again = (np.diff(points.first[order]) == 0) & (np.diff(images[order]) < EQUAL_TOLERANCE)
+    return (len(points) - int(again.sum())) / words
 
 
-def nearest_that_meet(points: Doubles, shared: Company) -> Doubles:
-    """From points of each of the target's subspaces to the nearest of those that meet it; infinite where none does.
+def compute_intersection_distances(points: Doubles, shared: SharedSubDatabase) -> Doubles:
+    """Distance from points of each target subspace to the nearest subspace that intersects it; infinite without one.
 
     min_j dist(x_i, Q'_j) in the paper's terms. (N, p, D) -> (N, p)
     """
     nearest = np.full(points.shape[:2], np.inf)
-    for start in range(0, len(shared.meetings), PAIRS):
-        pairs = shared.meetings.take(np.arange(start, min(start + PAIRS, len(shared.meetings))))
+    for start in range(0, len(shared.intersections), PAIRS):
+        pairs = shared.intersections.take(np.arange(start, min(start + PAIRS, len(shared.intersections))))
         other = shared.subspaces.take(pairs.second)
         offsets = points[pairs.first] - other.origins[:, None]  # (P, p, D)
         outside = offsets - (offsets @ other.bases.transpose(0, 2, 1)) @ other.bases

@@ -1,11 +1,11 @@
-"""The words nearest to affine subspaces: a fast pass finds which words they can be, float64 decides among them.
+"""Search for the words nearest to affine subspaces: a fast pass finds the candidates, float64 decides among them.
 
 With p the point of D nearest to zero and B its orthonormal basis, a unit word u has dist(D, u)² = 1 + |p|² − s, where its score
 s = 2 p·u + |B u|². So nearly all of the work is one matrix product, 2·N·(dim + 1)·K·D operations: the floor.
 
-Why no near word is lost. The fast pass rounds p, B and each product, so that its score is off by at most E (`_error`). Of the
-`count` words that it scores highest, the lowest has s' and so a true score of at least s' − E; a word that it scores below
-s' − 2 E has a true score below that. Every other word is handed on. Zero is no special case; float64 tells it from small.
+No near word is lost. The fast pass rounds p, B and each product, so its score is off by at most E (`_bound_error`). Let s' be
+the lowest of its `count` highest scores: the true score of that word is at least s' − E. A word scored below s' − 2 E has a lower
+true score. Every other word is a candidate. Zero is no special case; float64 separates it from small distances.
 """
 
 from __future__ import annotations
@@ -22,26 +22,25 @@ from bench.types import Bytes, Floats, Indices, Subspaces
 Doubles = NDArray[np.float64]
 
 BLOCK = 2048  # words in a block
-ROWS = 1024  # rows of B and p that share one reading of the words: a block of products stays near the processor
-GROUP = 32  # words, at most, that are looked at one by one only if the best of them may count
-GROUPS = 32  # for each word that is asked for, at least, if there are as many words
-NEAR = 1024  # words asked for, of several subspaces, that float64 decides on together
-FAR = 1e9  # the distance of no word
-TIE = 1e-12  # distances that differ by less count as equal; float64 errs by about 1e-16
+ROWS = 1024  # rows of B and p per pass over the words: a block of products stays in the cache
+GROUP = 32  # greatest number of words tested one by one only if the best of them may be near
+GROUPS = 32  # least number of groups per requested word, if there are enough words
+NEAR = 1024  # requested words, over several subspaces, that float64 decides together
+FAR = 1e9  # placeholder distance of a missing word
+TIE_TOLERANCE = 1e-12  # distances that differ by less count as equal; float64 errs by about 1e-16
 
 
-def nearest_to_subspaces(release: Subspaces, words: Bytes | Floats, count: int = 1) -> tuple[Indices, Doubles]:
-    """The nearest words of each subspace, nearest first, ties to the lowest index, and their distances.
+def find_nearest_to_subspaces(release: Subspaces, words: Bytes | Floats, count: int = 1) -> tuple[Indices, Doubles]:
+    """Return the nearest words of each subspace, nearest first, ties to the lowest index, and their distances.
 
     Parameters
     ----------
     words : (K, D) uint8 or float32, none zero; their directions count, as `unit_rows` gives them
-    count : how many words; all, if there are fewer
+    count : number of words; all if there are fewer
 
     Returns
     -------
-    (N, min(count, K)) int64 and float64. Distances are from the subspace as it was released: in float32, so that a word which the
-    defense put there lies about 1e-7 off.
+    (N, min(count, K)) int64 and float64. Distances are to the released float32 subspace: adversarial words lie about 1e-7 off.
     """
     count = min(count, len(words))
     feet, frames = feet_and_frames(release)
@@ -50,21 +49,22 @@ def nearest_to_subspaces(release: Subspaces, words: Bytes | Floats, count: int =
     step = max(1, ROWS // (release.dim + 1))
     for start in range(0, len(release), step):
         batch = slice(start, start + step)
-        rows, near = _possible(feet[batch], frames[batch], words, count)
+        rows, near = _find_candidates(feet[batch], frames[batch], words, count)
         found[batch], distances[batch] = _decide(feet[batch], frames[batch], words, rows, near, count)
     return found, distances
 
 
 def feet_and_frames(release: Subspaces) -> tuple[Doubles, Doubles]:
-    """The point of each subspace nearest to zero, and a basis orthonormal to float64. -> (N, D), (N, dim, D)"""
+    """Return the point of each subspace nearest to zero, and a basis orthonormal to float64. -> (N, D), (N, dim, D)"""
     frames = np.linalg.qr(release.bases.astype(np.float64).transpose(0, 2, 1))[0].transpose(0, 2, 1)
     origins = release.origins.astype(np.float64)[:, None]  # (N, 1, D)
     return (origins - origins @ frames.transpose(0, 2, 1) @ frames)[:, 0], frames
 
 
-def guesses(release: Subspaces) -> Floats:
-    """For each subspace the direction of its point nearest to zero, negative components cut: what one guesses of a descriptor
-    that is nowhere negative and of unit norm, if D is all one knows. -> (N, D) unit norm
+def guess_descriptors(release: Subspaces) -> Floats:
+    """Return the direction of each subspace's point nearest to zero, with negative components set to zero. -> (N, D) unit norm
+
+    This is the best guess of a non-negative unit descriptor from D alone.
     """
     cut = np.maximum(feet_and_frames(release)[0], 0.0)
     cut[~cut.any(axis=1)] = 1.0
@@ -72,25 +72,25 @@ def guesses(release: Subspaces) -> Floats:
 
 
 def project(release: Subspaces, points: Doubles) -> Doubles:
-    """The point of each subspace nearest to its own point. (N, D) -> (N, D)"""
+    """Return the point of each subspace nearest to the given one. (N, D) -> (N, D)"""
     feet, frames = feet_and_frames(release)
     return feet + (points[:, None] @ frames.transpose(0, 2, 1) @ frames)[:, 0]
 
 
-def _possible(feet: Doubles, frames: Doubles, words: Bytes | Floats, count: int) -> tuple[Indices, Indices]:
-    """Pairs of a subspace and a word that may be one of its nearest, by subspace. (n, D), (n, dim, D), (K, D) -> (P,) twice"""
+def _find_candidates(feet: Doubles, frames: Doubles, words: Bytes | Floats, count: int) -> tuple[Indices, Indices]:
+    """Find pairs of a subspace and a word that may be near it, by subspace. (n, D), (n, dim, D), (K, D) -> (P,) twice"""
     device = pick_device()
     dtype = pick_dtype(device)
     exact = np.concatenate([feet[:, None], frames], axis=1).transpose(1, 0, 2)  # (1 + dim, n, D)
     coarse = torch.from_numpy(exact).to(dtype)
-    error = _error(exact, coarse.double().numpy(), dtype, words.dtype)  # (n,)
+    error = _bound_error(exact, coarse.double().numpy(), dtype, words.dtype)  # (n,)
     planes, allowed = coarse.to(device), torch.from_numpy(2 * error).float().to(device)[:, None]
     size = max(1, min(GROUP, len(words) // (GROUPS * count)))
-    # The highest scores of the words so far, no two of one group: the lowest of them bounds the count-th highest from below.
+    # The highest scores so far, one per group: the lowest of them is a lower bound of the count-th highest.
     best = torch.full((len(feet), count), torch.finfo(torch.float32).min, device=device)
     waiting, pairs = [], []
     for start in range(0, len(words), BLOCK):
-        scores = _scores(planes, torch.from_numpy(words[start : start + BLOCK]).to(device))  # (n, K')
+        scores = _compute_scores(planes, torch.from_numpy(words[start : start + BLOCK]).to(device))  # (n, K')
         ragged = -scores.shape[1] % size
         if ragged:
             scores = torch.nn.functional.pad(scores, (0, ragged), value=-torch.inf)
@@ -100,37 +100,37 @@ def _possible(feet: Doubles, frames: Doubles, words: Bytes | Floats, count: int)
             continue
         best = torch.cat([best, *(maxima for _, _, maxima in waiting)], dim=1).topk(count, dim=1, sorted=False).values
         least = best.amin(dim=1, keepdim=True) - allowed  # (n, 1)
-        pairs += [_at_least(least, *block) for block in waiting]
+        pairs += [_select_at_least(least, *block) for block in waiting]
         waiting = []
-    rows, near, found = (torch.cat(part) for part in zip(*pairs, strict=True))
-    kept = found >= least[rows, 0]  # as it stands now that all words were seen
-    rows, order = rows[kept].sort(stable=True)
-    return rows.cpu().numpy(), near[kept][order].cpu().numpy()
+    rows, near, scores = (torch.cat(part) for part in zip(*pairs, strict=True))
+    passing = scores >= least[rows, 0]  # the final bound, after all words
+    rows, order = rows[passing].sort(stable=True)
+    return rows.cpu().numpy(), near[passing][order].cpu().numpy()
 
 
-def _at_least(least: Tensor, start: int, groups: Tensor, maxima: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The words of a block that score enough: subspace, word, score. (n, 1), start, (n, size, G), (n, G) -> (P,) thrice"""
+def _select_at_least(least: Tensor, start: int, groups: Tensor, maxima: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Select the words of a block by score: subspace, word, score. (n, 1), start, (n, size, G), (n, G) -> three of (P,)"""
     row, group = (maxima >= least).nonzero(as_tuple=True)
     members = groups[row, :, group]  # (S, size)
-    hit, place = (members >= least[row]).nonzero(as_tuple=True)
-    return row[hit], start + place * groups.shape[2] + group[hit], members[hit, place]
+    hit, member = (members >= least[row]).nonzero(as_tuple=True)
+    return row[hit], start + member * groups.shape[2] + group[hit], members[hit, member]
 
 
-def _scores(planes: Tensor, block: Tensor) -> Tensor:
-    """2 p·u + |B u|², about. (1 + dim, n, D), (K', D) -> (n, K') float32"""
-    scale = block.float().square().sum(dim=1).rsqrt()  # (K',) words are multiplied as they are: bytes are exact in bf16
+def _compute_scores(planes: Tensor, block: Tensor) -> Tensor:
+    """Approximate 2 p·u + |B u|². (1 + dim, n, D), (K', D) -> (n, K') float32"""
+    scale = block.float().square().sum(dim=1).rsqrt()  # (K',) words are multiplied unscaled: bytes are exact in bf16
     products = (planes.flatten(0, 1) @ block.to(planes.dtype).T).unflatten(0, planes.shape[:2])  # (1 + dim, n, K')
     scores = torch.zeros(products.shape[1:], device=planes.device)
-    for product in products[1:]:  # one after the other, so that a copy in float32 stays in the cache
+    for product in products[1:]:  # one at a time, so that a float32 copy stays in the cache
         wide = product.float()
         scores.addcmul_(wide, wide)
     return scores.mul_(scale).add_(products[0], alpha=2).mul_(scale)
 
 
-def _error(exact: Doubles, rounded: Doubles, dtype: torch.dtype, words: np.dtype) -> Doubles:
-    """How far a score of the fast pass can be off. (1 + dim, n, D) twice -> (n,)
+def _bound_error(exact: Doubles, rounded: Doubles, dtype: torch.dtype, words: np.dtype) -> Doubles:
+    """Bound the error of a score of the fast pass. (1 + dim, n, D) twice -> (n,)
 
-    Let r bound the relative error of one rounding (2^-8 for bf16), and let p', B', u' be what is multiplied instead of p, B, u.
+    Let r bound the relative error of one rounding (2^-8 for bf16), and let p', B', u' be the rounded p, B, u.
     s = D 2^-23 is twice what a sum of D products in float32 can err by, relative to the norms, which covers the few float32
     operations that follow as well. Then p·u errs by at most
 
@@ -157,25 +157,25 @@ def _error(exact: Doubles, rounded: Doubles, dtype: torch.dtype, words: np.dtype
 def _decide(
     feet: Doubles, frames: Doubles, words: Bytes | Floats, rows: Indices, near: Indices, count: int
 ) -> tuple[Indices, Doubles]:
-    """Of the possible words of each subspace the nearest. (n, D), (n, dim, D), (K, D), (P,) twice -> (n, count) twice"""
-    found, measured = np.empty((len(feet), count), dtype=np.int64), np.empty((len(feet), count))
+    """Select the nearest among the candidates of each subspace. (n, D), (n, dim, D), (K, D), (P,) twice -> (n, count) twice"""
+    nearest, distances = np.empty((len(feet), count), dtype=np.int64), np.empty((len(feet), count))
     few = max(1, NEAR // count)
     for start in range(0, len(feet), few):
         part = slice(start, start + few)
         first, last = (np.searchsorted(rows, np.arange(len(feet))[part], side)[:, None] for side in ("left", "right"))
-        places = first + np.arange((last - first).max())  # (f, c) of which each subspace uses as many as it has words
-        table = near[np.minimum(places, last - 1)]
+        positions = first + np.arange((last - first).max())  # (f, c), of which each subspace uses its number of candidates
+        table = near[np.minimum(positions, last - 1)]
         offsets = unit_rows(words[table]) - feet[part, None]  # (f, c, D) float64
         offsets -= offsets @ frames[part].transpose(0, 2, 1) @ frames[part]
-        distances = np.where(places < last, np.linalg.norm(offsets, axis=2), FAR)  # (f, c)
-        found[part], measured[part] = _ranked(table, distances, count)
-    return found, measured
+        norms = np.where(positions < last, np.linalg.norm(offsets, axis=2), FAR)  # (f, c)
+        nearest[part], distances[part] = _rank_words(table, norms, count)
+    return nearest, distances
 
 
-def _ranked(table: Indices, distances: Doubles, count: int) -> tuple[Indices, Doubles]:
-    """The words of least distance in each row, ties to the lowest index. (f, c) twice -> (f, count) twice"""
+def _rank_words(table: Indices, distances: Doubles, count: int) -> tuple[Indices, Doubles]:
+    """Return the words of least distance in each row, ties to the lowest index. (f, c) twice -> (f, count) twice"""
     order = np.argsort(distances, axis=1)
     table, distances = np.take_along_axis(table, order, axis=1), np.take_along_axis(distances, order, axis=1)
-    ranks = (np.diff(distances, axis=1, prepend=0) > TIE).cumsum(axis=1)
+    ranks = (np.diff(distances, axis=1, prepend=0) > TIE_TOLERANCE).cumsum(axis=1)
     order = np.lexsort((table, ranks), axis=1)[:, :count]
     return np.take_along_axis(table, order, axis=1), np.take_along_axis(distances, order, axis=1)

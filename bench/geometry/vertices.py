@@ -1,13 +1,13 @@
-"""Degenerate vertices of many polytopes {x = o + Bᵀ c : x >= 0} at once, by the simplex method in coordinates of the subspace.
+"""Degenerate vertices of a batch of polytopes {x = o + Bᵀ c : x >= 0}, by the simplex method in coordinates of the subspace.
 
 A vertex is where `dim` components vanish, its *frame*; it is degenerate where more do. With s the components of the frame, x
-= T [1, s] for a tableau T (D, 1 + dim), whose first column is the vertex. A pivot releases one component of the frame,
-follows that edge to where the objective is least, and puts the component that vanishes there into the frame: an update of
+= T [1, s] for a tableau T (D, 1 + dim), whose first column is the vertex. A pivot removes one component from the frame,
+follows that edge to the least objective, and adds the component that vanishes there to the frame: an update of
 rank one.
 
-The objective is Σ_j w_j x_j, a negative x_j counting PENALTY w_j |x_j|, so that no feasible vertex is needed to begin with.
+The objective is Σ_j w_j x_j, a negative x_j counting PENALTY w_j |x_j|, so that no feasible initial vertex is needed.
 Along an edge it is convex and piecewise linear. At an optimum the weights become 1 / (x + SOFT) (reweighted L1; Candès,
-Wakin, Boyd 2008), and after ROUNDS of those they are drawn anew.
+Wakin, Boyd 2008), and after ROUNDS of those they are drawn again.
 """
 
 from __future__ import annotations
@@ -20,43 +20,43 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bench.core.device import pick_double_device
-from bench.geometry.pivoting import independent_rows
+from bench.geometry.pivoting import select_independent_rows
 
 Doubles = NDArray[np.float64]
 
 PENALTY = 20.0
 SOFT = 0.02
 ROUNDS = 4
-ZERO = 1e-6  # a component no larger vanishes: float32 leaves errors of about 1e-8, which a frame amplifies
-UNIT = 1e-5  # a norm this near to 1 is 1
+ZERO = 1e-6  # a component no larger counts as zero: float32 leaves errors of about 1e-8, which a frame amplifies
+UNIT = 1e-5  # a norm this near to 1 counts as 1
 FLAT = 1e-6  # a component that changes by less along an edge is constant on it
 SLOPE = 1e-9  # an edge along which the objective falls by less does not lead down
-APART = 1e-4  # vertices that are the same when rounded to this are one
-BATCH = 256  # polytopes at a time, so that their tableaus stay near the processor
-REFRESH = 32  # pivots after which tableaus are made anew, and walks that are over are dropped
+EQUAL_TOLERANCE = 1e-4  # vertices that agree when rounded to this are one
+BATCH = 256  # polytopes per batch, so that their tableaus stay in the cache
+REFRESH = 32  # pivots after which tableaus are recomputed and finished walks are dropped
 
 
-def unit_vertices(
+def find_unit_vertices(
     origins: Doubles, bases: Doubles, pivots: int, enough: Callable[[Tensor], Tensor], rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], Doubles]:
-    """Walk over the vertices of each polytope and report those that are degenerate, nowhere negative and of norm 1.
+    """Walk over the vertices of each polytope and return those that are degenerate, non-negative and of norm 1.
 
     Parameters
     ----------
     origins, bases : (N, D), (N, dim, D)
     pivots : length of a walk
-    enough : of (n, D) such vertices, which end the walk of their polytope; -> (n,) bool
+    enough : (n, D) vertices -> (n,) bool, whether the walk of their polytope ends
 
     Returns
     -------
-    (n,) the polytope that each vertex is of, ascending, and (n, D) the vertices, each once.
+    (n,) the polytope of each vertex, ascending, and (n, D) the vertices, each once.
     """
     owners, points = [np.empty(0, dtype=np.int64)], [np.empty((0, origins.shape[1]))]
     for start in range(0, len(origins), BATCH):
         o, b = origins[start : start + BATCH], bases[start : start + BATCH]
-        owner, point = _distinct(*_walk(o, b, pivots, enough, rng))
+        owner, point = _deduplicate(*_walk(o, b, pivots, enough, rng))
         owners.append(owner + start)
-        points.append(_polished(o[owner], b[owner], point))
+        points.append(_polish(o[owner], b[owner], point))
     return np.concatenate(owners), np.concatenate(points)
 
 
@@ -68,53 +68,53 @@ def _walk(
     device = pick_double_device()
     o, b = torch.from_numpy(origins).to(device), torch.from_numpy(bases).to(device)
 
-    def drawn(rows: int) -> Tensor:
+    def draw_weights(rows: int) -> Tensor:
         return torch.from_numpy(rng.random((rows, length))).to(device)
 
     # Rows scaled at random make the first frame a function of D and `rng` alone: their norms do not depend on the basis.
     scaled = bases.transpose(0, 2, 1) * rng.random((count, length, 1))  # (n, D, dim)
-    frame = torch.from_numpy(independent_rows(scaled)).to(device)  # (n, dim)
-    owner, weights, rounds = torch.arange(count, device=device), drawn(count), torch.zeros(count, device=device)
+    frame = torch.from_numpy(select_independent_rows(scaled)).to(device)  # (n, dim)
+    owner, weights, rounds = torch.arange(count, device=device), draw_weights(count), torch.zeros(count, device=device)
     live = torch.ones(count, dtype=torch.bool, device=device)
     owners, points = [owner[:0]], [o[:0]]
     for pivot in range(pivots):
         if pivot % REFRESH == 0:
-            o, b, frame, owner, weights, rounds = (kept[live] for kept in (o, b, frame, owner, weights, rounds))
+            o, b, frame, owner, weights, rounds = (part[live] for part in (o, b, frame, owner, weights, rounds))
             live = live[live]
             varying = b.norm(dim=1) > FLAT  # (n, D)
-            tableau = _tableau(o, b, frame)  # (n, D, 1 + dim)
-        hit = live & _certified(tableau[:, :, 0], varying, dim)
+            tableau = _build_tableau(o, b, frame)  # (n, D, 1 + dim)
+        hit = live & _certify(tableau[:, :, 0], varying, dim)
         owners.append(owner[hit])
         points.append(tableau[hit, :, 0])
         live[hit] = ~enough(points[-1])
-        edge, sign, slope = _steepest(tableau, frame, weights)
+        edge, sign, slope = _select_edge(tableau, frame, weights)
         optimal = slope >= -SLOPE
-        into = _lowest(tableau, frame, weights, edge, sign, slope)
+        into = _select_component(tableau, frame, weights, edge, sign, slope)
         if optimal.any():
             again, over = optimal & (rounds < ROUNDS), optimal & (rounds >= ROUNDS)
             weights[again] = SOFT / (tableau[again, :, 0].clamp(min=0) + SOFT)
-            weights[over] = drawn(int(over.sum()))
+            weights[over] = draw_weights(int(over.sum()))
             rounds = torch.where(again, rounds + 1, torch.where(over, 0, rounds))
         _exchange(tableau, frame, edge, into, ~optimal)
     return torch.cat(owners).cpu().numpy(), torch.cat(points).cpu().numpy()
 
 
-def _certified(x: Tensor, varying: Tensor, dim: int) -> Tensor:
-    """Whether more components vanish than make a vertex, none is negative and the norm is 1. (n, D), (n, D) -> (n,)"""
+def _certify(x: Tensor, varying: Tensor, dim: int) -> Tensor:
+    """Whether the vertex is degenerate, non-negative and of norm 1. (n, D), (n, D) -> (n,)"""
     vanishing = ((x.abs() <= ZERO) & varying).sum(dim=1)
     return (vanishing > dim) & (x.amin(dim=1) >= -ZERO) & ((x.norm(dim=1) - 1).abs() <= UNIT)
 
 
-def _tableau(o: Tensor, b: Tensor, frame: Tensor) -> Tensor:
-    """(n, D), (n, dim, D), (n, dim) -> (n, D, 1 + dim)"""
+def _build_tableau(o: Tensor, b: Tensor, frame: Tensor) -> Tensor:
+    """Build the tableau of each frame. (n, D), (n, dim, D), (n, dim) -> (n, D, 1 + dim)"""
     at_frame = b.gather(2, frame[:, None].expand(-1, b.shape[1], -1))  # (n, dim, dim)
     edges = torch.linalg.solve_ex(at_frame, b)[0].mT  # (n, D, dim)
     x = o - (edges @ o.gather(1, frame)[:, :, None])[:, :, 0]
     return torch.cat([x[:, :, None], edges], dim=2)
 
 
-def _steepest(tableau: Tensor, frame: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The edge along which the objective falls most, its direction, and its slope. -> (n,) index, (n,) ±1, (n,)"""
+def _select_edge(tableau: Tensor, frame: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Select the edge of steepest descent: its index, direction and slope. -> (n,) index, (n,) ±1, (n,)"""
     x = tableau[:, :, 0]
     gain = torch.where(x >= -ZERO, weights, -PENALTY * weights).scatter(1, frame, 0.0)  # (n, D) without the frame
     slopes = torch.bmm(gain[:, None], tableau[:, :, 1:])[:, 0]  # (n, dim)
@@ -125,14 +125,14 @@ def _steepest(tableau: Tensor, frame: Tensor, weights: Tensor) -> tuple[Tensor, 
     return edge, torch.where(rises, 1.0, -1.0).to(x), slope
 
 
-def _lowest(tableau: Tensor, frame: Tensor, weights: Tensor, edge: Tensor, sign: Tensor, slope: Tensor) -> Tensor:
-    """The component that vanishes where the objective is least along an edge. -> (n,)"""
+def _select_component(tableau: Tensor, frame: Tensor, weights: Tensor, edge: Tensor, sign: Tensor, slope: Tensor) -> Tensor:
+    """Select the component that vanishes at the least objective along an edge. -> (n,)"""
     x = tableau[:, :, 0]
     direction = tableau.gather(2, (edge + 1)[:, None, None].expand(-1, x.shape[1], 1))[:, :, 0] * sign[:, None]  # (n, D)
     meets = ((x > ZERO) & (direction < -FLAT)) | ((x < -ZERO) & (direction > FLAT)) | ((x.abs() <= ZERO) & (direction < -FLAT))
     meets.scatter_(1, frame, False)
     distance = torch.where(meets, (-x / direction).clamp(min=0), torch.inf)
-    # Where a component changes its sign, the slope grows by what it counted and what it will count.
+    # Where a component changes its sign, the slope grows by its weight before and after.
     bend = torch.where(meets, (1 + PENALTY) * weights * direction.abs(), 0.0)
     order = distance.argsort(dim=1)
     rising = slope[:, None] + bend.gather(1, order).cumsum(dim=1) >= 0
@@ -140,7 +140,7 @@ def _lowest(tableau: Tensor, frame: Tensor, weights: Tensor, edge: Tensor, sign:
 
 
 def _exchange(tableau: Tensor, frame: Tensor, edge: Tensor, into: Tensor, where: Tensor) -> None:
-    """Put component `into` into the frame in the place `edge`, and update the tableau, in place."""
+    """Replace entry `edge` of the frame by component `into`, and update the tableau in place."""
     rows = torch.arange(len(tableau), device=tableau.device)
     row = tableau[rows, into]  # (n, 1 + dim)
     pivot = row[rows, edge + 1]
@@ -151,16 +151,16 @@ def _exchange(tableau: Tensor, frame: Tensor, edge: Tensor, into: Tensor, where:
     frame[rows, edge] = torch.where(where, into, frame[rows, edge])
 
 
-def _distinct(owners: NDArray[np.int64], points: Doubles) -> tuple[NDArray[np.int64], Doubles]:
-    """Each vertex of each polytope once. (n,), (n, D) -> (m,), (m, D)"""
-    key = np.column_stack([owners, np.rint(points / APART)]).astype(np.int64)
+def _deduplicate(owners: NDArray[np.int64], points: Doubles) -> tuple[NDArray[np.int64], Doubles]:
+    """Return each vertex of each polytope once. (n,), (n, D) -> (m,), (m, D)"""
+    key = np.column_stack([owners, np.rint(points / EQUAL_TOLERANCE)]).astype(np.int64)
     first = np.sort(np.unique(key, axis=0, return_index=True)[1])
     first = first[np.argsort(owners[first], kind="stable")]
     return owners[first], points[first]
 
 
-def _polished(origins: Doubles, bases: Doubles, points: Doubles) -> Doubles:
-    """The points of D whose vanishing components are least in the mean square. (n, D), (n, dim, D), (n, D) -> (n, D)"""
+def _polish(origins: Doubles, bases: Doubles, points: Doubles) -> Doubles:
+    """Return the points of D with the least mean square of the vanishing components. (n, D), (n, dim, D), (n, D) -> (n, D)"""
     vanishing = bases * (points <= 10 * ZERO)[:, None]  # (n, dim, D)
     coordinates = np.linalg.solve(vanishing @ bases.transpose(0, 2, 1), -vanishing @ origins[:, :, None])  # (n, dim, 1)
     return origins + (coordinates.transpose(0, 2, 1) @ bases)[:, 0]

@@ -1,1 +1,1 @@
-"""Photographs, their views, scenes, and the samples that records are about."""
+"""Photographs, their views, scenes, and the samples of a run."""

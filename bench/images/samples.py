@@ -1,4 +1,4 @@
-"""What records are about, one each: a photograph, a pair of images, a query of a place, or a whole place."""
+"""Samples: each record is about one photograph, pair of images, query of a scene, or whole scene."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from bench.images.scene import Mask, Pixels, Scene, SceneImage
 from bench.types import Bytes
 
 if TYPE_CHECKING:
-    from bench.api import Dataset, Task
+    from bench.api import Dataset
+    from bench.task_api import Task
 
 ImageSource = Source | Pixels
 Images = Path | str | Sequence[Path | str | Source] | None
@@ -23,71 +24,73 @@ Images = Path | str | Sequence[Path | str | Source] | None
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Sample:
-    """One thing that is judged. The runner extracts and protects each of its images."""
+    """One sample of an experiment. The runner extracts and protects each of its images."""
 
     name: str
     images: tuple[ImageSource, ...]
-    condition: str | None = None  # such as "night"; results are told apart by it
-    subject: Any = None  # what else its task must know of it
+    condition: str | None = None  # such as "night"; results are grouped by it
+    subject: Any = None  # task-specific data
 
     def content_hash(self) -> str:
-        """Of all of its images; of one that cannot be read, that it cannot."""
+        """Hash all images. An unreadable image contributes its error."""
         hashes = [_content_hash(image) for image in self.images]
         return hashes[0] if len(hashes) == 1 else digest(hashes)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Collection:
-    """The units of a run, and what they share."""
+    """The samples of a run."""
 
     name: str
     samples: tuple[Sample, ...]
-    scene: Scene | None = None  # the place that they are of, if they are of one
-    beside: Mapping[str, str] = field(default_factory=dict)  # digests of what results depend on beside the units' images
+    scene: Scene | None = None  # of all samples, if they have one in common
+    extra_inputs: Mapping[str, str] = field(default_factory=dict)  # digests of inputs other than the samples' images
 
 
 def collect_photographs(images: Images) -> Collection:
-    """A unit for each photograph of a folder, or of those given; the built-in ones for None.
+    """Return one sample for each photograph of a folder or a list; None stands for the built-in photographs.
 
     Raises
     ------
     UserError
-        if there is no such folder, it holds no photograph, or two have one name.
+        if there is no such folder, no photograph in it, or a name occurs twice.
     """
-    name, sources = _photographs(images)
+    name, sources = _list_sources(images)
     return Collection(name=name, samples=tuple(Sample(name=source.name, images=(source,)) for source in sources))
 
 
 def collect_only_photographs(task: Task, images: Images, dataset: Dataset | None) -> Collection:
-    """`of_photographs`, for a task that judges nothing else; raises UserError if it is given a place."""
+    """Call `collect_photographs` for a task that takes no dataset; raise UserError if a dataset is given."""
     if dataset is not None:
-        raise UserError(f"{task.name()} judges photographs and takes no dataset; give --images")
+        raise UserError(f"{task.name()} takes photographs, not a dataset; give --images")
     return collect_photographs(images)
 
 
 def collect_queries(dataset: Dataset) -> Collection:
-    """A unit for each query of a dataset's scene.
+    """Return one sample for each query of a dataset's scene.
 
     Raises
     ------
     UserError
-        if it has none, or is damaged.
+        if there is no query, or the dataset is damaged.
     """
     scene = dataset.scene()
     if not scene.queries:
         raise UserError(f"{scene.name}: the scene has no queries")
-    units = (Sample(name=query.name, images=(query.pixels,), condition=query.condition, subject=query) for query in scene.queries)
+    queries = (
+        Sample(name=query.name, images=(query.pixels,), condition=query.condition, subject=query) for query in scene.queries
+    )
     return Collection(
         name=scene.name,
-        samples=tuple(units),
+        samples=tuple(queries),
         scene=scene,
-        beside={"scene": digest([scene.unit, fingerprint(scene.references), fingerprint(scene.queries)])},
+        extra_inputs={"scene": digest([scene.unit, hash_scene_images(scene.references), hash_scene_images(scene.queries)])},
     )
 
 
-def fingerprint(images: Sequence[SceneImage]) -> str:
-    """A digest of images of a scene: their contents, and what is known of their cameras and poses."""
-    known = [
+def hash_scene_images(images: Sequence[SceneImage]) -> str:
+    """Return a digest of images of a scene: contents, cameras and poses."""
+    described = [
         [
             image.name,
             image.condition,
@@ -98,16 +101,16 @@ def fingerprint(images: Sequence[SceneImage]) -> str:
         ]
         for image in images
     ]
-    return digest(known)
+    return digest(described)
 
 
 def read_pixels(image: ImageSource) -> tuple[Bytes, tuple[str, ...]]:
-    """The pixels, (H, W, 3) uint8 RGB, and notes on what was converted.
+    """Return the pixels, (H, W, 3) uint8 RGB, and notes on their conversion.
 
     Raises
     ------
-    UnitError
-        if it cannot be read.
+    SampleError
+        if the image cannot be read.
     """
     if isinstance(image, Source):
         photograph = photographs.read(image.path)
@@ -116,12 +119,12 @@ def read_pixels(image: ImageSource) -> tuple[Bytes, tuple[str, ...]]:
 
 
 def read_foreground(image: ImageSource) -> Mask | None:
-    """(H, W), True where something hides the scene that moves; None where that is not known."""
+    """Return the mask of moving objects in front of the scene, (H, W); None if it is not known."""
     return None if isinstance(image, Source) else image.foreground()
 
 
 def image_path(image: ImageSource) -> Path | None:
-    """The file that an image is in, if it is in one."""
+    """Return the file of an image, None if it has none."""
     return getattr(image, "path", None)
 
 
@@ -132,11 +135,11 @@ def _content_hash(image: ImageSource) -> str:
         return f"unreadable: {error.strerror}"  # its record will be `failed`
 
 
-def _photographs(images: Images) -> tuple[str, list[Source]]:
+def _list_sources(images: Images) -> tuple[str, list[Source]]:
     if images is None:
-        return "builtin", photographs.builtin()
+        return "builtin", photographs.list_builtin()
     if isinstance(images, (str, Path)):
-        return Path(images).resolve().name, photographs.folder(Path(images))
+        return Path(images).resolve().name, photographs.list_photographs(Path(images))
     sources = [image if isinstance(image, Source) else Source(Path(image).name, Path(image)) for image in images]
     if len({source.name for source in sources}) < len(sources):
         raise UserError("two of the photographs have the same file name")

@@ -1,4 +1,4 @@
-"""The views of a photograph that dictionaries are made from and networks are trained on."""
+"""Views of a photograph, to build dictionaries from and to train networks on."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 from bench.api import Extractor
 from bench.core.errors import SampleError, UserError
 from bench.core.progress import Progress
-from bench.images.photographs import Source, decode, square
+from bench.images.photographs import Source, crop_square, decode
 from bench.types import Bytes, Features
 
 SIDES = (256, 320)  # pixels
@@ -22,101 +22,101 @@ MIRRORED = (False, True)
 
 @dataclass(frozen=True, eq=False)
 class PhotographView:
-    """A photograph at one size, as it is or mirrored."""
+    """A photograph at one size, mirrored or not."""
 
     photograph: str  # the photograph's content hash
     pixels: Bytes  # (S, S, 3)
     features: Features
 
 
-def views(source: Source, extractor: Extractor) -> Iterator[PhotographView]:
-    """The centred square at 256 and at 320 pixels, as it is and mirrored, each with its own features.
+def extract_views(source: Source, extractor: Extractor) -> Iterator[PhotographView]:
+    """Yield the centred square at 256 and 320 pixels, each unmirrored and mirrored, with its own features.
 
     Raises
     ------
-    UnitError
+    SampleError
         if the photograph cannot be read or has no keypoint.
     """
     image, _ = decode(source.path)
     photograph = source.content_hash()
     for side in SIDES:
-        pixels = square(image, side)
+        pixels = crop_square(image, side)
         for mirrored in MIRRORED:
-            yield _view(pixels, mirrored, photograph, source, extractor)
+            yield _extract_view(pixels, mirrored, photograph, source, extractor)
 
 
-def _view(pixels: Bytes, mirrored: bool, photograph: str, source: Source, extractor: Extractor) -> PhotographView:
+def _extract_view(pixels: Bytes, mirrored: bool, photograph: str, source: Source, extractor: Extractor) -> PhotographView:
     if mirrored:
         pixels = np.ascontiguousarray(pixels[:, ::-1])
     return PhotographView(photograph, pixels, extractor.extract(pixels, source.path))
 
 
-class OnDemand(Sequence[PhotographView]):
-    """The same views of more photographs than memory holds, in the same order, each made whenever it is asked for.
+class LazyViews(Sequence[PhotographView]):
+    """The views of `extract_views` for any number of photographs, in the same order, extracted at each access.
 
-    Iterating leaves out those that cannot be made.
+    Iteration skips views that cannot be extracted.
     """
 
     def __init__(self, sources: Sequence[Source], extractor: Extractor) -> None:
         self._extractor = extractor
-        self._which = [(source, side, mirrored) for source in sources for side in SIDES for mirrored in MIRRORED]
-        self._photograph = functools.cache(Source.content_hash)  # which reads the whole file
+        self._keys = [(source, side, mirrored) for source in sources for side in SIDES for mirrored in MIRRORED]
+        self._hash = functools.cache(Source.content_hash)  # reads the whole file
 
     @property
     def photographs(self) -> set[str]:
-        """Content hashes, for which every photograph is read once."""
-        return {self._photograph(source) for source, _, _ in self._which}
+        """Content hashes of the photographs. Each photograph is read once."""
+        return {self._hash(source) for source, _, _ in self._keys}
 
     def __len__(self) -> int:
-        return len(self._which)
+        return len(self._keys)
 
     @overload
-    def __getitem__(self, place: int) -> PhotographView: ...
+    def __getitem__(self, index: int) -> PhotographView: ...
     @overload
-    def __getitem__(self, place: slice) -> OnDemand: ...
-    def __getitem__(self, place: int | slice) -> PhotographView | OnDemand:
-        """One view, or some of them, still to be made.
+    def __getitem__(self, index: slice) -> LazyViews: ...
+    def __getitem__(self, index: int | slice) -> PhotographView | LazyViews:
+        """Return one view, or a slice that is extracted on demand.
 
         Raises
         ------
-        UnitError
+        SampleError
             if the photograph cannot be read or has no keypoint.
         """
-        if isinstance(place, slice):
-            some = OnDemand((), self._extractor)
-            some._which, some._photograph = self._which[place], self._photograph
-            return some
-        source, side, mirrored = self._which[place]
+        if isinstance(index, slice):
+            subset = LazyViews((), self._extractor)
+            subset._keys, subset._hash = self._keys[index], self._hash
+            return subset
+        source, side, mirrored = self._keys[index]
         image, _ = decode(source.path)
-        return _view(square(image, side), mirrored, self._photograph(source), source, self._extractor)
+        return _extract_view(crop_square(image, side), mirrored, self._hash(source), source, self._extractor)
 
     def __iter__(self) -> Iterator[PhotographView]:
-        for place in range(len(self)):
+        for index in range(len(self)):
             with suppress(SampleError):
-                yield self[place]
+                yield self[index]
 
 
-def photographs_of(some: Sequence[PhotographView]) -> set[str]:
-    """The content hashes of their photographs."""
-    return some.photographs if isinstance(some, OnDemand) else {view.photograph for view in some}
+def collect_photograph_hashes(views: Sequence[PhotographView]) -> set[str]:
+    """Return the content hashes of the photographs of `views`."""
+    return views.photographs if isinstance(views, LazyViews) else {view.photograph for view in views}
 
 
-def collect(sources: list[Source], extractor: Extractor) -> list[PhotographView]:
-    """All views of all photographs; a photograph that cannot be read is named on stderr and left out.
+def collect_views(sources: list[Source], extractor: Extractor) -> list[PhotographView]:
+    """Return all views of all photographs. An unreadable photograph is reported on stderr and skipped.
 
     Raises
     ------
     UserError
-        if no photograph is left.
+        if no photograph can be used.
     """
-    collected: list[PhotographView] = []
+    views: list[PhotographView] = []
     with Progress("features", len(sources)) as progress:
         for source in sources:
             try:
-                collected += list(views(source, extractor))
+                views += list(extract_views(source, extractor))
             except SampleError as error:
-                progress.say(f"left out: {error}")
+                progress.log(f"skipped: {error}")
             progress.advance()
-    if not collected:
+    if not views:
         raise UserError("none of the photographs could be used")
-    return collected
+    return views

@@ -1,1 +1,1 @@
-"""The network that paints a photograph from a release: encoding, architecture, loss, data, training, weights."""
+"""The network that reconstructs a photograph from a release: encoding, architecture, loss, data, training, weights."""

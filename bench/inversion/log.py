@@ -1,4 +1,4 @@
-"""What training tells TensorBoard, where somebody wants it."""
+"""An optional TensorBoard log of a training."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ if TYPE_CHECKING:
 
 
 class Log:
-    """Numbers by name and step, for TensorBoard; nowhere for None."""
+    """Writes numbers by name and step for TensorBoard; does nothing if the folder is None."""
 
     def __init__(self, folder: Path | None) -> None:
-        """Open the log; one that is there already goes on.
+        """Open the log, or continue an existing one.
 
         Raises
         ------
@@ -32,7 +32,7 @@ class Log:
             raise UserError("--log needs tensorboard: pip install 'feature-privacy-bench[logs]'") from None
         self._writer = SummaryWriter(str(folder))
 
-    def scalars(self, values: Mapping[str, float], step: int) -> None:
+    def add_scalars(self, values: Mapping[str, float], step: int) -> None:
         if self._writer is not None:
             for name, value in values.items():
                 self._writer.add_scalar(name, value, step)

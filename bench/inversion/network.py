@@ -1,10 +1,10 @@
-"""The inversion network: an MLP embeds each keypoint, embeddings are scattered to a grid, a U-Net paints the photograph.
+"""The inversion network: an MLP embeds each keypoint, embeddings are scattered to a grid, a U-Net reconstructs the photograph.
 
-After Pittaluga et al. (CVPR 2019) and Dosovitskiy and Brox (CVPR 2016), made small: the grid has one cell for 4 x 4 pixels, a
-keypoint's place within its cell being an input of its embedding, and most channels are where cells are few. Each keypoint also
-paints a patch around itself, as wide as what its descriptor has seen, which no convolution of a sparse map does as soon.
+A small version of Pittaluga et al. (CVPR 2019) and Dosovitskiy and Brox (CVPR 2016). The grid has one cell per 4 x 4 pixels; the
+position of a keypoint within its cell is an input of its embedding. Coarse levels have most channels. Each keypoint also adds a
+patch around itself, as wide as the support of its descriptor, which convolutions of a sparse map reach only in deep layers.
 
-The rule for keypoints that share a cell: their embeddings are added up, and a channel of its own counts them; so are patches.
+Keypoints that share a cell: their embeddings are summed, and an extra channel counts them. Patches are summed as well.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import torch
 import torch.nn.functional as nnf
 from torch import Tensor, nn
 
-from bench.inversion.encoding import CELL, Points
+from bench.inversion.encoding import CELL, EncodedRelease
 
 COARSENET = (256, 256, 256, 512, 512, 512)  # its encoder's channels (Pittaluga et al., CVPR 2019)
 
@@ -25,14 +25,14 @@ COARSENET = (256, 256, 256, 512, 512, 512)  # its encoder's channels (Pittaluga 
 class Shape:
     """The network's sizes."""
 
-    inputs: int  # numbers a keypoint
-    candidates: int = 0  # how many of them are embedded one by one and added up; 0: all numbers are embedded together
-    length: int = 0  # of one of these candidates
+    inputs: int  # numbers per keypoint
+    candidates: int = 0  # candidates that are embedded one by one and summed; 0: all numbers are embedded together
+    length: int = 0  # of one candidate
     hidden: int = 256  # width of the embedding MLP
     widths: tuple[int, ...] = (32, 64, 112, 112)  # channels at 1/4, 1/8, ... of the image's side
     last: int = 32  # channels at 1/2
-    patch: int = 6  # cells: the side of what a keypoint paints around itself
-    painted: int = 16  # channels of that
+    patch: int = 6  # cells: the side of the patch around a keypoint
+    painted: int = 16  # channels of the patch; the name is part of the file format
 
 
 class Inverter(nn.Module):
@@ -58,9 +58,9 @@ class Inverter(nn.Module):
         self.refine = conv_norm(shape.last, shape.last)
         self.paint = nn.Conv2d(shape.last, 3 * (CELL // 2) ** 2, 3, padding=1)
 
-    def forward(self, points: Points) -> Tensor:
+    def forward(self, points: EncodedRelease) -> Tensor:
         rows, columns = points.grid
-        step = 2 ** len(self.down)  # of the deepest level's grid; an image of another size is painted with an empty margin
+        step = 2 ** len(self.down)  # of the deepest level's grid; images of other sizes get an empty margin
         margin = (0, -columns % step, 0, -rows % step)
         level = self.stem(nnf.pad(self.scatter(points), margin))
         levels = [level]
@@ -69,42 +69,42 @@ class Inverter(nn.Module):
         level = levels.pop()
         for up in self.up:
             level = up(level, levels.pop())
-        halved = self.refine(doubled(self.narrow(level)))
-        painted = nnf.pixel_shuffle(self.paint(halved).float(), CELL // 2) + 0.5
-        return painted[:, :, : points.size[0], : points.size[1]]  # (B, 3, H, W)
+        half = self.refine(upsample(self.narrow(level)))
+        images = nnf.pixel_shuffle(self.paint(half).float(), CELL // 2) + 0.5
+        return images[:, :, : points.size[0], : points.size[1]]  # (B, 3, H, W)
 
-    def scatter(self, points: Points) -> Tensor:
-        """What keypoints say of their cells and of those around them. -> (B, first + painted, H/4, W/4), channels last"""
-        hidden = self.embedded(points)
+    def scatter(self, points: EncodedRelease) -> Tensor:
+        """Sum the embeddings and patches of keypoints in a grid. -> (B, first + painted, H/4, W/4), channels last"""
+        hidden = self.embed_points(points)
         own = self.own(hidden)
-        counted = torch.cat([own, torch.ones_like(own[:, :1])], dim=1)
-        cells = added_up(counted, points.image, points.places.long(), (points.batch, *points.grid))
-        return torch.cat([cells, self.patches(hidden, points)], dim=3).permute(0, 3, 1, 2)
+        with_count = torch.cat([own, torch.ones_like(own[:, :1])], dim=1)
+        cells = sum_by_cell(with_count, points.image, points.coordinates.long(), (points.batch, *points.grid))
+        return torch.cat([cells, self.scatter_patches(hidden, points)], dim=3).permute(0, 3, 1, 2)
 
-    def patches(self, hidden: Tensor, points: Points) -> Tensor:
-        """The patches around keypoints, in cells. What lies outside of the image is lost. -> (B, H/4, W/4, painted)"""
+    def scatter_patches(self, hidden: Tensor, points: EncodedRelease) -> Tensor:
+        """Sum the patches around keypoints in a grid, without the parts outside the image. -> (B, H/4, W/4, painted)"""
         side, (rows, columns) = self.shape.patch, points.grid
-        corner = (points.places + (side + 1) / 2).long()  # (P, 2) in a grid with a margin, as wide as a patch, on all sides
+        corner = (points.coordinates + (side + 1) / 2).long()  # (P, 2) in a grid with a margin, as wide as a patch, on all sides
         steps = torch.arange(side, device=corner.device)
         row, column = corner[:, 1, None, None] + steps[:, None], corner[:, 0, None, None] + steps  # (P, side, 1), (P, 1, side)
         cells = torch.stack(torch.broadcast_tensors(column, row), dim=3).view(-1, 2)
-        painted = self.around(hidden).view(-1, self.shape.painted)  # (P side side, painted)
+        patches = self.around(hidden).view(-1, self.shape.painted)  # (P side side, painted)
         shape = points.batch, rows + 2 * side, columns + 2 * side
-        grid = added_up(painted, points.image.repeat_interleave(side * side), cells, shape)
+        grid = sum_by_cell(patches, points.image.repeat_interleave(side * side), cells, shape)
         return grid[:, side : side + rows, side : side + columns]
 
-    def embedded(self, points: Points) -> Tensor:
-        """What is made of each keypoint. -> (P, hidden)"""
+    def embed_points(self, points: EncodedRelease) -> Tensor:
+        """Embed each keypoint. -> (P, hidden)"""
         return self.embed_set(points.values) if self.shape.candidates else self.embed(points.values)
 
     def embed_set(self, values: Tensor) -> Tensor:
-        """Embed each candidate with what goes for all, and add up: their order says nothing. (P, F) -> (P, hidden)"""
+        """Embed each candidate with the common inputs, and sum. Their order has no effect. (P, F) -> (P, hidden)"""
         count, length = self.shape.candidates, self.shape.length
         candidates = values[:, : count * length].view(-1, count, length)  # (P, m, D)
         common = values[:, None, count * length :].expand(-1, count, -1)
         hidden = self.embed(torch.cat([candidates, common], dim=2))  # (P, m, hidden)
-        there = candidates.any(dim=2)[..., None]  # the others are padding
-        return (hidden * there).sum(dim=1) / there.sum(dim=1).clamp(min=1).sqrt()
+        present = candidates.any(dim=2)[..., None]  # not padding
+        return (hidden * present).sum(dim=1) / present.sum(dim=1).clamp(min=1).sqrt()
 
 
 def conv_norm(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
@@ -128,7 +128,7 @@ class Residual(nn.Module):
 
 
 class Up(nn.Module):
-    """Doubles the resolution and adds the encoder's level of that resolution: half of the operations of joining it."""
+    """Doubles the resolution and adds the encoder's level of that resolution: half the operations of concatenation."""
 
     def __init__(self, wide: int, narrow: int) -> None:
         super().__init__()
@@ -137,16 +137,16 @@ class Up(nn.Module):
         self.refine = conv_norm(narrow, narrow)
 
     def forward(self, deep: Tensor, skip: Tensor) -> Tensor:
-        return self.refine(self.join(doubled(self.narrow(deep)) + skip))
+        return self.refine(self.join(upsample(self.narrow(deep)) + skip))
 
 
-def doubled(level: Tensor) -> Tensor:
-    """(B, C, H, W) -> (B, C, 2 H, 2 W)"""
+def upsample(level: Tensor) -> Tensor:
+    """Double the resolution. (B, C, H, W) -> (B, C, 2 H, 2 W)"""
     return nnf.interpolate(level, scale_factor=2.0, mode="nearest")
 
 
-def added_up(values: Tensor, image: Tensor, cells: Tensor, shape: tuple[int, int, int]) -> Tensor:
-    """Values (P, C) of each image's cells (P, 2), column and row, added up in a grid. -> (*shape, C)"""
+def sum_by_cell(values: Tensor, image: Tensor, cells: Tensor, shape: tuple[int, int, int]) -> Tensor:
+    """Sum values (P, C) by image and cell (P, 2), column and row, in a grid. -> (*shape, C)"""
     batch, rows, columns = shape
-    places = (image * rows + cells[:, 1]) * columns + cells[:, 0]
-    return values.new_zeros(batch * rows * columns, values.shape[1]).index_add(0, places, values).view(*shape, -1)
+    indices = (image * rows + cells[:, 1]) * columns + cells[:, 0]
+    return values.new_zeros(batch * rows * columns, values.shape[1]).index_add(0, indices, values).view(*shape, -1)

@@ -1,4 +1,4 @@
-"""Trained networks, found again by what they were made from."""
+"""A cache of trained networks, by the inputs of their training."""
 
 from __future__ import annotations
 
@@ -16,32 +16,32 @@ from bench.registry import spec
 KIND = "networks"
 
 
-def key(plan: Plan) -> dict[str, Any]:
-    """All that the network is a function of."""
+def build_key(plan: Plan) -> dict[str, Any]:
+    """Return all inputs of the training."""
     public = Public()
     return {
-        "defense": spec.configuration(plan.defense, public),
-        "served": {field: str(setting) for field, setting in plan.served.items()},
+        "defense": spec.to_json_with_digests(plan.defense, public),
+        "served": {field: str(setting) for field, setting in plan.supported_settings.items()},
         "photographs": [source.content_hash() for source in plan.photographs],
         "validation": [source.content_hash() for source in plan.validation],
-        "extractor": spec.written(plan.extractor),
+        "extractor": spec.to_json(plan.extractor),
         "crossfit": [public.digest(asset) for asset in plan.crossfit],
-        "start": None if plan.start is None else weights.load(plan.start).digest,
+        "start": None if plan.initial_checkpoint is None else weights.load(plan.initial_checkpoint).digest,
         "encoding": plan.encoding,
         "widths": list(plan.widths),
         "training": dataclasses.asdict(plan.training),
-        "source": provenance.source(train.__name__, type(plan.defense).__module__, type(plan.extractor).__module__),
-        "environment": environment.computing(),
+        "source": provenance.hash_modules(train.__name__, type(plan.defense).__module__, type(plan.extractor).__module__),
+        "environment": environment.describe_platform(),
     }
 
 
-def fetch(made_from: dict[str, Any], out: Path) -> dict[str, Any] | None:
-    """Copy the network that was made from that to `out`, unless something is there; its metadata, or None if there is none."""
-    if out.exists() or not store.copy(KIND, made_from, out):
+def fetch(key: dict[str, Any], out: Path) -> dict[str, Any] | None:
+    """Copy the cached network to `out` unless that exists, and return its metadata; None if nothing is cached or `out` exists."""
+    if out.exists() or not store.copy_file(KIND, key, out):
         return None
     return weights.load(out).meta
 
 
-def keep(made_from: dict[str, Any], out: Path) -> None:
-    """Keep a copy of the network in `out`."""
-    store.keep(KIND, made_from, out)
+def save(key: dict[str, Any], out: Path) -> None:
+    """Add the network in `out` to the cache."""
+    store.store_file(KIND, key, out)

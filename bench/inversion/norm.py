@@ -1,4 +1,4 @@
-"""Batch norm over a batch that several processes share. PyTorch's own, `SyncBatchNorm`, does so on GPUs alone."""
+"""Batch norm over a batch that several processes share. PyTorch's `SyncBatchNorm` works on GPUs only."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ class JointBatchNorm2d(nn.BatchNorm2d):
         wide = x if x.dtype == torch.float64 else x.float()  # sums over a batch are too long for half precision
         processes = distributed.get_world_size()
         moments = torch.stack([wide.mean(dim=(0, 2, 3)), wide.square().mean(dim=(0, 2, 3))])  # (2, C)
-        mean, square = _Summed.apply(moments) / processes
-        variance = (square - mean.square()).clamp(min=0)  # which rounding could make negative
-        self._remember(mean.detach(), variance.detach(), x.numel() // x.shape[1] * processes)
+        mean, square = _AllReduceSum.apply(moments) / processes
+        variance = (square - mean.square()).clamp(min=0)  # rounding could make it negative
+        self._update_running_statistics(mean.detach(), variance.detach(), x.numel() // x.shape[1] * processes)
         scale = self.weight * torch.rsqrt(variance + self.eps)
         shift = self.bias - mean * scale
         return (wide * scale[:, None, None] + shift[:, None, None]).to(x.dtype)
 
     @torch.no_grad()
-    def _remember(self, mean: Tensor, variance: Tensor, count: int) -> None:
-        """Move the running statistics as batch norm does, whose running variance is the unbiased one."""
+    def _update_running_statistics(self, mean: Tensor, variance: Tensor, count: int) -> None:
+        """Update the running statistics as batch norm does, with the unbiased variance."""
         assert self.running_mean is not None
         assert self.running_var is not None
         assert self.momentum is not None
@@ -36,8 +36,8 @@ class JointBatchNorm2d(nn.BatchNorm2d):
         self.running_var.lerp_(variance * (count / max(1, count - 1)), self.momentum)
 
 
-class _Summed(torch.autograd.Function):
-    """The sum of a tensor over all processes, every one of which has it and adds to its gradient."""
+class _AllReduceSum(torch.autograd.Function):
+    """The sum of a tensor over all processes. Its gradient is summed over all processes, too."""
 
     @staticmethod
     def forward(context: Any, part: Tensor) -> Tensor:
@@ -47,11 +47,11 @@ class _Summed(torch.autograd.Function):
 
     @staticmethod
     def backward(context: Any, gradient: Tensor) -> Tensor:
-        return _Summed.forward(context, gradient)
+        return _AllReduceSum.forward(context, gradient)
 
 
-def joint(module: nn.Module) -> None:
-    """Make every batch norm of a module, in place, one over the batch of all processes."""
+def convert_batch_norms(module: nn.Module) -> None:
+    """Convert every batch norm of a module, in place, to one over the batch of all processes."""
     for inner in module.modules():
         if type(inner) is nn.BatchNorm2d:
             inner.__class__ = JointBatchNorm2d

@@ -1,7 +1,7 @@
 """Muon for matrices, AdamW for the rest.
 
-Muon (Jordan et al., 2024; Liu et al., arXiv 2502.16982) moves a matrix by the nearest orthogonal one to its averaged gradient, so
-that no direction waits for others. A convolution is the matrix of its outputs by all that one of them reads.
+Muon (Jordan et al., 2024; Liu et al., arXiv 2502.16982) updates a matrix by the orthogonal matrix nearest to
+its averaged gradient, so that all directions move equally far. A convolution is the matrix of its outputs by its inputs.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ from torch import Tensor, nn
 
 
 class Optimizer:
-    """Both at one rate: Muon's updates are scaled to be as large as AdamW's usually are."""
+    """Muon and AdamW at one rate: Muon's updates are scaled to the usual size of AdamW's."""
 
     def __init__(self, module: nn.Module, rate: float, decay: float) -> None:
         self.weights: dict[str, Tensor] = dict(module.named_parameters())
-        self.matrices = {name: matrix(weight.detach()) for name, weight in self.weights.items() if weight.ndim > 1}
-        self.others = {name: weight for name, weight in self.weights.items() if name not in self.matrices}
+        self.matrices = {name: view_as_matrix(weight.detach()) for name, weight in self.weights.items() if weight.ndim > 1}
+        self.vectors = {name: weight for name, weight in self.weights.items() if name not in self.matrices}
         self.muon = torch.optim.Muon(self.matrices.values(), rate, weight_decay=decay, adjust_lr_fn="match_rms_adamw")
-        self.adamw = torch.optim.AdamW(self.others.values(), rate, weight_decay=decay)
-        self.parts = (self.matrices, self.muon), (self.others, self.adamw)
+        self.adamw = torch.optim.AdamW(self.vectors.values(), rate, weight_decay=decay)
+        self.parts = (self.matrices, self.muon), (self.vectors, self.adamw)
 
     @property
     def rate(self) -> float:
@@ -34,15 +34,15 @@ class Optimizer:
             group["lr"] = rate
 
     def step(self) -> None:
-        """Move all weights that have a gradient."""
+        """Update all weights that have a gradient."""
         for name, view in self.matrices.items():
             gradient = self.weights[name].grad
-            view.grad = None if gradient is None else matrix(gradient)
+            view.grad = None if gradient is None else view_as_matrix(gradient)
         self.muon.step()
         self.adamw.step()
 
     def state(self) -> dict[str, Tensor]:
-        """What `restore` takes: the moments of each weight, by its name."""
+        """Return the moments of each weight by its name, for `restore`."""
         return {
             f"{name}/{key}": value
             for weights, optimizer in self.parts
@@ -51,7 +51,7 @@ class Optimizer:
         }
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
-        """Go on from what `state` gave."""
+        """Load the result of `state`."""
         for weights, optimizer in self.parts:
             whole = optimizer.state_dict()
             whole["state"] = {
@@ -61,6 +61,6 @@ class Optimizer:
             optimizer.load_state_dict(whole)
 
 
-def matrix(weight: Tensor) -> Tensor:
-    """A view of a weight as (outputs, all that one reads); of convolutions that are kept channels last, or 1 x 1."""
+def view_as_matrix(weight: Tensor) -> Tensor:
+    """View a weight as (outputs, inputs). Convolutions must be in channels-last layout, or 1 x 1."""
     return weight if weight.ndim == 2 else weight.permute(0, 2, 3, 1).view(len(weight), -1)

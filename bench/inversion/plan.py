@@ -1,4 +1,4 @@
-"""What a network is a function of: releases, photographs, sizes, and how long it trains."""
+"""The inputs of a training: releases, photographs, sizes and schedule."""
 
 from __future__ import annotations
 
@@ -6,17 +6,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from bench.api import Asset, Defense, Extractor
+from bench.api import Defense, Extractor
 from bench.core.errors import UserError
 from bench.images.photographs import Source
-from bench.inversion.data import Served
+from bench.inversion.data import SupportedSettings
 from bench.inversion.encoding import Encoding
 from bench.inversion.network import COARSENET, Shape
+from bench.settings import Asset
 
 
 @dataclass(frozen=True, kw_only=True)
 class Training:
-    """How long and how fast."""
+    """The schedule of a training."""
 
     steps: int = 4000
     batch: int = 8
@@ -35,14 +36,14 @@ class Training:
 class Plan:
     """One training. No photograph should be in both sets."""
 
-    defense: Defense  # with the settings that are fixed
-    served: Served  # fields whose settings are drawn at random in training; one network serves them all
+    defense: Defense  # with its fixed settings
+    supported_settings: SupportedSettings  # fields whose settings are drawn at random in training
     photographs: Sequence[Source]
     validation: Sequence[Source]
     extractor: Extractor
-    crossfit: Sequence[Asset] = ()  # dictionaries for photographs that helped to make the defense's own
-    start: Path | None = None  # weights to start from, of a network for such releases or for raw descriptors; random ones if None
-    encoding: Encoding = "invariant"  # what the network is told of a keypoint
+    crossfit: Sequence[Asset] = ()  # dictionaries for photographs that the defense's own was built from
+    initial_checkpoint: Path | None = None  # a network for such releases or for raw descriptors; random weights if None
+    encoding: Encoding = "invariant"  # input of the network
     widths: tuple[int, ...] = Shape.widths  # of the network's levels
     training: Training = Training()  # frozen
 
@@ -57,6 +58,6 @@ class Profile:
 
 PROFILES = {
     "cpu": Profile(),
-    # The paper's network and about as many photographs as it had, each seen 40 times: days of a GPU.
+    # The paper's network and about as many photographs, each used 40 times: days on a GPU.
     "paper": Profile(widths=COARSENET, training=Training(steps=125_000, batch=32, rate=2e-3, warmup=1000, average=0.9998)),
 }

@@ -1,7 +1,7 @@
-"""The processes that train one network, each on a device of its own and on its part of every batch.
+"""Processes that train one network, each on its own device and its part of every batch.
 
-Lightning Fabric starts them; PyTorch's `DistributedDataParallel` averages their gradients. What they compute is what one process
-computes of the whole batch, up to rounding: parts are equal, and batch norm is over all of them.
+Lightning Fabric starts them; PyTorch's `DistributedDataParallel` averages their gradients. The result is that of one process with
+the whole batch, up to rounding: parts are equal, and batch norm is over the whole batch.
 """
 
 from __future__ import annotations
@@ -27,41 +27,41 @@ from bench.inversion import norm
 if TYPE_CHECKING:
     from lightning_fabric import Fabric
 
-# That processes start is no news; each of them imports this module before Fabric says so.
-for talkative in ("distributed", "rank_zero"):
-    logging.getLogger(f"lightning_fabric.utilities.{talkative}").setLevel(logging.WARNING)
+# Silence messages about process starts; each process imports this module before Fabric logs them.
+for module_name in ("distributed", "rank_zero"):
+    logging.getLogger(f"lightning_fabric.utilities.{module_name}").setLevel(logging.WARNING)
 
 
 @dataclass(frozen=True, eq=False)
-class Team:
-    """One process's place among them all; alone by default."""
+class ProcessGroup:
+    """The group of processes as seen by one of them; a single process by default."""
 
     rank: int = 0
     size: int = 1
     fabric: Fabric | None = None
 
     @property
-    def leads(self) -> bool:
-        """Whether this is the one that writes files and reports."""
+    def is_main(self) -> bool:
+        """Whether this process writes files and reports."""
         return self.rank == 0
 
-    def part(self, batch: int) -> range:
-        """The places of a batch that this process computes."""
-        each = batch // self.size
-        return range(self.rank * each, (self.rank + 1) * each)
+    def assign_indices(self, batch: int) -> range:
+        """Return the indices of the batch that this process computes."""
+        count = batch // self.size
+        return range(self.rank * count, (self.rank + 1) * count)
 
-    def share(self, module: nn.Module) -> nn.Module:
-        """What to call in training instead of the module, so that its gradients are those of the whole batch."""
+    def wrap(self, module: nn.Module) -> nn.Module:
+        """Wrap a module for training, so that its gradients are those of the whole batch."""
         if self.fabric is None:
             return module
         if pick_device().type == "cuda":
             module = nn.SyncBatchNorm.convert_sync_batchnorm(module)
         else:
-            norm.joint(module)
+            norm.convert_batch_norms(module)
         return self.fabric.strategy.setup_module(module)
 
-    def mean(self, value: torch.Tensor) -> float:
-        """The mean over all processes."""
+    def average(self, value: torch.Tensor) -> float:
+        """Return the mean over all processes."""
         if self.fabric is not None:
             reduced = self.fabric.all_reduce(value, reduce_op="mean")
             assert isinstance(reduced, torch.Tensor)
@@ -70,7 +70,7 @@ class Team:
 
 
 def launch(devices: int, batch: int, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-    """Run function(team, *args, **kwargs) in as many processes, and return what it returns in the first. All must be picklable.
+    """Run function(group, *args, **kwargs) in one process per device and return the first one's result. All must be picklable.
 
     Raises
     ------
@@ -80,13 +80,13 @@ def launch(devices: int, batch: int, function: Callable[..., Any], *args: Any, *
         a `UserError` or `OSError` of the function.
     """
     if devices == 1:
-        return function(Team(), *args, **kwargs)
+        return function(ProcessGroup(), *args, **kwargs)
     device = pick_device().type
-    there = {"cuda": torch.cuda.device_count(), "cpu": os.cpu_count() or 1}.get(device, 1)
-    if not 1 < devices <= there:
-        raise UserError(f"--devices {devices}: from 1 to {there} can be used here ({device})")
+    available = {"cuda": torch.cuda.device_count(), "cpu": os.cpu_count() or 1}.get(device, 1)
+    if not 1 < devices <= available:
+        raise UserError(f"--devices {devices}: must be from 1 to {available} on this machine ({device})")
     if batch % devices:
-        raise UserError(f"--batch {batch}: {devices} devices cannot share that equally; take a multiple of {devices}")
+        raise UserError(f"--batch {batch}: must be a multiple of {devices}, the number of devices")
     try:
         from lightning_fabric import Fabric
     except ImportError:
@@ -95,21 +95,23 @@ def launch(devices: int, batch: int, function: Callable[..., Any], *args: Any, *
     with tempfile.TemporaryDirectory() as folder:
         failure = Path(folder) / "failure"
         try:
-            return fabric.launch(partial(_work, failure=failure, function=function, args=args, kwargs=kwargs))
+            return fabric.launch(partial(_run_worker, failure=failure, function=function, args=args, kwargs=kwargs))
         except torch.multiprocessing.ProcessRaisedException:
             if failure.is_file():
                 raise pickle.loads(failure.read_bytes()) from None
             raise
 
 
-def _work(fabric: Fabric, failure: Path, function: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-    """What each process does. An error that is meant for the user is left in a file, for exceptions reach the parent as text."""
-    team = Team(fabric.global_rank, fabric.world_size, fabric)
-    if not team.leads:
-        sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115  # one report is enough; open while the process lives
+def _run_worker(
+    fabric: Fabric, failure: Path, function: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]
+) -> Any:
+    """Run the function in one process. Errors for the user are pickled to a file, since exceptions reach the parent as text."""
+    group = ProcessGroup(fabric.global_rank, fabric.world_size, fabric)
+    if not group.is_main:
+        sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115  # only the main process reports; open until the process ends
     try:
-        return function(team, *args, **kwargs)
+        return function(group, *args, **kwargs)
     except (UserError, OSError) as error:
-        failure.with_name(f"{team.rank}").write_bytes(pickle.dumps(error))
-        failure.with_name(f"{team.rank}").replace(failure)
+        failure.with_name(f"{group.rank}").write_bytes(pickle.dumps(error))
+        failure.with_name(f"{group.rank}").replace(failure)
         raise

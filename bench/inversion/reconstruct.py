@@ -1,4 +1,4 @@
-"""What an attacker shows: a photograph painted by a network of a release, under each symmetry that is known."""
+"""Inference: reconstructs a photograph from a release with a network, averaged over symmetries."""
 
 from __future__ import annotations
 
@@ -8,28 +8,31 @@ import torch
 from torch import Tensor, nn
 
 from bench.core.device import pick_dtype
-from bench.inversion.encoding import Encoding, Points, encode
+from bench.inversion.encoding import EncodedRelease, Encoding, encode
 from bench.inversion.symmetry import Symmetry
 from bench.types import Floats, Release
 
 
-def painted(
-    module: nn.Module, release: Release, seen: Sequence[Symmetry], known: Floats, slots: int, encoding: Encoding
+def reconstruct_image(
+    module: nn.Module, release: Release, symmetries: Sequence[Symmetry], settings: Floats, slots: int, encoding: Encoding
 ) -> Floats:
-    """The mean of what the network paints of a release under each symmetry, moved back. -> (H, W, 3) in [0, 1]
+    """Return the mean reconstruction over symmetries of the release, each transformed back. -> (H, W, 3) in [0, 1]
 
-    A network's mistakes on them differ, and some cancel.
+    The errors of the network differ between symmetries, and some cancel.
     """
     images = []
-    for symmetry in seen:
-        moved = encode([symmetry.of_release(release)], [known], slots, encoding)
-        images.append(symmetry.undone(paint(module, moved)[0]))
+    for symmetry in symmetries:
+        encoded = encode([symmetry.transform_release(release)], [settings], slots, encoding)
+        images.append(symmetry.invert_image(infer(module, encoded)[0]))
     return torch.stack(images).mean(dim=0).permute(1, 2, 0).cpu().numpy()
 
 
 @torch.inference_mode()
-def paint(module: nn.Module, points: Points) -> Tensor:
-    """-> (B, 3, H, W) float32 in [0, 1]. Deterministic on one machine with one number of threads."""
+def infer(module: nn.Module, points: EncodedRelease) -> Tensor:
+    """Run a network. -> (B, 3, H, W) float32 in [0, 1]
+
+    Deterministic on one machine with a fixed number of threads.
+    """
     device = next(module.parameters()).device
     dtype = pick_dtype(device)
     with torch.autocast(device.type, dtype, enabled=dtype != torch.float32):

@@ -1,7 +1,7 @@
-"""What would have been released of the photograph mirrored or turned, for an attacker to learn from, and to paint eight times.
+"""Releases of the mirrored or rotated photograph, derived from the release of the photograph.
 
-A gradient histogram of the photograph so moved is the photograph's own in another order, which an extractor knows of itself; and
-what defenses release of a descriptor is rearranged as descriptors are.
+Attackers use them in training and average reconstructions over all eight. A gradient histogram of the transformed photograph is a
+permutation of the original one, which the extractor declares; releases are permuted as descriptors are.
 """
 
 from __future__ import annotations
@@ -15,85 +15,88 @@ import numpy as np
 from torch import Tensor
 
 from bench.api import Extractor
-from bench.types import Bytes, Descriptors, Floats, Indices, Release, Subspaces, WordSets
+from bench.types import Bytes, Descriptors, Floats, Indices, Points, Release, Subspaces, WordSets
 
 
 @dataclass(frozen=True, eq=False)
 class Symmetry:
-    """One of the eight of a square: left and right change places, or do not; then the photograph is turned."""
+    """One of the eight symmetries of a square: an optional left-right mirror, then a rotation."""
 
     mirrored: bool
     turns: int  # quarters, counter-clockwise
-    order: Indices | None  # (D,) of a descriptor's components; None for those who look at positions alone
+    order: Indices | None  # (D,) permutation of a descriptor's components; None: positions alone
 
-    def of_image(self, pixels: Bytes) -> Bytes:
-        """The photograph so moved. (H, W, 3) -> (H, W, 3), or (W, H, 3) where it is turned by one or three quarters"""
+    def transform_image(self, pixels: Bytes) -> Bytes:
+        """Transform the photograph. (H, W, 3) -> (H, W, 3), or (W, H, 3) for one or three quarter turns"""
         return np.ascontiguousarray(np.rot90(pixels[:, ::-1] if self.mirrored else pixels, self.turns))
 
-    def undone(self, image: Tensor) -> Tensor:
-        """Moved back. (3, H, W)"""
+    def invert_image(self, image: Tensor) -> Tensor:
+        """Apply the inverse to an image. (3, H, W)"""
         back = image.rot90(-self.turns, (1, 2))
         return back.flip(2) if self.mirrored else back
 
-    def of_release(self, release: Release) -> Release:
-        """What would have been released of the photograph so moved.
+    def transform_release(self, release: Release) -> Release:
+        """Return the release of the transformed photograph.
 
         Raises
         ------
         TypeError
-            if there is an order and nothing is defined for this kind of release.
+            if there is a permutation and this kind of release does not support one.
         """
         if self.order is not None:
-            release = _rearranged(release, self.order, self)
+            release = _permute(release, self.order, self)
         (width, height), (x, y) = release.size, release.keypoints.T
         if self.mirrored:
             x = width - x
         for _ in range(self.turns):
             x, y, width, height = y, width - x, height, width
-        return dataclasses.replace(release, keypoints=np.stack([x, y], axis=1, dtype=np.float32), size=(width, height))
+        positions = Points(keypoints=np.stack([x, y], axis=1, dtype=np.float32))
+        return dataclasses.replace(release, positions=positions, size=(width, height))
 
 
 IDENTITY = Symmetry(False, 0, None)
-OF_POSITIONS = tuple(Symmetry(mirrored, turns, None) for mirrored in (False, True) for turns in range(4))
+POSITION_SYMMETRIES = tuple(Symmetry(mirrored, turns, None) for mirrored in (False, True) for turns in range(4))
 
 
-def symmetries(extractor: Extractor) -> tuple[Symmetry, ...]:
-    """Those under which an extractor tells what becomes of its descriptors; at least that which moves nothing."""
+def find_symmetries(extractor: Extractor) -> tuple[Symmetry, ...]:
+    """Return the symmetries for which the extractor declares permutations, the identity first."""
     mirror, turn = extractor.mirror_order(), extractor.turn_order()
-    found = [IDENTITY] if mirror is None else [IDENTITY, Symmetry(True, 0, mirror)]
+    symmetries = [IDENTITY] if mirror is None else [IDENTITY, Symmetry(True, 0, mirror)]
     if turn is not None:
         for turns in range(1, 4):
-            found += [_turned(symmetry, turn) for symmetry in found if symmetry.turns == turns - 1]
-    return tuple(found)
+            symmetries += [_rotate(symmetry, turn) for symmetry in symmetries if symmetry.turns == turns - 1]
+    return tuple(symmetries)
 
 
-def _turned(symmetry: Symmetry, turn: Indices) -> Symmetry:
+def _rotate(symmetry: Symmetry, turn: Indices) -> Symmetry:
     order = turn if symmetry.order is None else symmetry.order[turn]
     return Symmetry(symmetry.mirrored, symmetry.turns + 1, order)
 
 
 @singledispatch
-def _rearranged(release: Release, order: Indices, symmetry: Symmetry) -> Release:
-    raise TypeError(f"what a mirrored or turned photograph makes of {type(release).__name__} is not defined")
+def _permute(release: Release, order: Indices, symmetry: Symmetry) -> Release:
+    raise TypeError(f"symmetries of {type(release).__name__} are not defined")
 
 
-@_rearranged.register
+@_permute.register
 def _(release: Descriptors, order: Indices, symmetry: Symmetry) -> Release:
-    return dataclasses.replace(release, descriptors=release.descriptors[:, order], frames=_moved(release.frames, symmetry))
+    return dataclasses.replace(
+        release, descriptors=release.descriptors[:, order], frames=_transform_frames(release.frames, symmetry)
+    )
 
 
-@_rearranged.register
+@_permute.register
 def _(release: WordSets, order: Indices, symmetry: Symmetry) -> Release:
     return dataclasses.replace(release, candidates=release.candidates[:, :, order], words=None)  # no words of the dictionary
 
 
-@_rearranged.register
+@_permute.register
 def _(release: Subspaces, order: Indices, symmetry: Symmetry) -> Release:
     return dataclasses.replace(release, origins=release.origins[:, order], bases=release.bases[:, :, order])
 
 
-def _moved(frames: Floats | None, symmetry: Symmetry) -> Floats | None:
-    """Scales stay, orientations, which are clockwise, move with the photograph."""
+def _transform_frames(frames: Floats | None, symmetry: Symmetry) -> Floats | None:
+    """Transform clockwise orientations with the photograph; scales stay."""
     if frames is None or frames.shape[1] == 1:
         return frames
     angle = np.float32(math.pi) - frames[:, 1] if symmetry.mirrored else frames[:, 1]

@@ -1,1 +1,1 @@
-"""What a server does with released features: a map of the references, retrieval, matching, and the pose of the query."""
+"""Localization from released features: a map of the references, retrieval, matching, and the pose of the query."""

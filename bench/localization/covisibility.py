@@ -1,4 +1,4 @@
-"""Which references to match with each other, from their poses alone, as hloc's `pairs_from_poses` chooses."""
+"""Pairs of references to match, selected by their poses alone, as hloc's `pairs_from_poses` does."""
 
 from __future__ import annotations
 
@@ -8,12 +8,14 @@ import numpy as np
 
 from bench.images.scene import Reference
 
-NEIGHBOURS = 20  # of each reference
-TURN = 60.0  # degrees between optical axes beyond which two images have too little in common
+NEIGHBOURS = 20  # per reference
+MAX_ANGLE = 60.0  # degrees between optical axes; beyond it two images have too little in common
 
 
-def pairs(references: Sequence[Reference], neighbours: int = NEIGHBOURS, turn: float = TURN) -> list[tuple[int, int]]:
-    """Each reference with the nearest of those that look its way: by the distance of centres, ties to the first.
+def select_pairs(
+    references: Sequence[Reference], neighbours: int = NEIGHBOURS, max_angle: float = MAX_ANGLE
+) -> list[tuple[int, int]]:
+    """Pair each reference with its nearest neighbours of similar direction: by the distance of centres, ties to the first.
 
     Returns
     -------
@@ -21,11 +23,11 @@ def pairs(references: Sequence[Reference], neighbours: int = NEIGHBOURS, turn: f
     """
     centres = np.array([image.cam_from_world.inverse().translation for image in references])  # (V, 3)
     axes = np.array([image.cam_from_world.rotation.matrix()[2] for image in references])  # (V, 3)
-    apart = np.linalg.norm(centres[:, None] - centres[None], axis=2)  # (V, V)
-    apart[axes @ axes.T < np.cos(np.radians(turn))] = np.inf
-    np.fill_diagonal(apart, np.inf)
-    found = set()
-    for a, row in enumerate(apart):
+    distances = np.linalg.norm(centres[:, None] - centres[None], axis=2)  # (V, V)
+    distances[axes @ axes.T < np.cos(np.radians(max_angle))] = np.inf
+    np.fill_diagonal(distances, np.inf)
+    pairs = set()
+    for a, row in enumerate(distances):
         nearest = np.argsort(row, kind="stable")[:neighbours]
-        found |= {(min(a, b), max(a, b)) for b in nearest.tolist() if np.isfinite(row[b])}
-    return sorted(found)
+        pairs |= {(min(a, b), max(a, b)) for b in nearest.tolist() if np.isfinite(row[b])}
+    return sorted(pairs)

@@ -1,7 +1,7 @@
-"""Makes the map of a place: matches among neighbouring references, and points triangulated from their known poses.
+"""Builds the map of a scene: matches among neighbouring references, and points triangulated from their known poses.
 
-A match is kept if it agrees with the poses: COLMAP's Sampson error of at most `EPIPOLAR` pixels. What is left goes through
-`pycolmap.Database` to COLMAP's triangulation, in one thread and with a seed, so that the same images make the same map.
+A match counts if it agrees with the poses: COLMAP's Sampson error is at most `EPIPOLAR` pixels. These matches go through
+`pycolmap.Database` to COLMAP's triangulation, in one thread and with a fixed seed, so that the same images give the same map.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ import numpy as np
 import pycolmap
 import torch
 
-from bench.core.colmap_log import quietly
+from bench.core.colmap_log import silence_colmap
 from bench.core.device import pick_device
 from bench.core.errors import UserError
 from bench.core.progress import Progress
-from bench.geometry.distances import mutual, points_to_points
+from bench.geometry.distances import find_mutual_nearest, points_to_points
 from bench.images.scene import Reference
 from bench.localization import covisibility
 from bench.localization.maps import Map
@@ -30,15 +30,15 @@ EPIPOLAR = 4.0  # pixels
 Matches = dict[tuple[int, int], Indices]  # references a < b -> (M, 2) keypoints of a, of b
 
 
-def build(references: Sequence[Reference], features: Sequence[Features]) -> Map:
-    """The map of references whose features were extracted.
+def build_map(references: Sequence[Reference], features: Sequence[Features]) -> Map:
+    """Build the map of references from their features.
 
     Raises
     ------
     UserError
         if no point could be triangulated.
     """
-    matches = verified(references, features, _matched(features, covisibility.pairs(references)))
+    matches = verify_matches(references, features, _match_pairs(features, covisibility.select_pairs(references)))
     points, xyz = triangulate(references, features, matches)
     if len(xyz) == 0:
         raise UserError("the map has no point: do the references overlap?")
@@ -54,25 +54,25 @@ def build(references: Sequence[Reference], features: Sequence[Features]) -> Map:
     )
 
 
-def verified(
+def verify_matches(
     references: Sequence[Reference], features: Sequence[Features], matches: Iterable[tuple[tuple[int, int], Indices]]
 ) -> Matches:
-    """The matches that agree with the known poses."""
-    rays = [_rays(reference, each) for reference, each in zip(references, features, strict=True)]
-    kept = {}
-    for (a, b), found in matches:
+    """Return the matches that agree with the known poses."""
+    rays = [_compute_rays(reference, each) for reference, each in zip(references, features, strict=True)]
+    inliers = {}
+    for (a, b), rows in matches:
         essential = pycolmap.essential_matrix_from_pose(references[b].cam_from_world * references[a].cam_from_world.inverse())
-        errors = np.asarray(pycolmap.compute_squared_sampson_error(rays[a][found[:, 0]], rays[b][found[:, 1]], essential))
+        errors = np.asarray(pycolmap.compute_squared_sampson_error(rays[a][rows[:, 0]], rays[b][rows[:, 1]], essential))
         focal = (references[a].camera.mean_focal_length() + references[b].camera.mean_focal_length()) / 2
-        kept[a, b] = found[errors * focal**2 <= EPIPOLAR**2]
-    return kept
+        inliers[a, b] = rows[errors * focal**2 <= EPIPOLAR**2]
+    return inliers
 
 
 def triangulate(references: Sequence[Reference], features: Sequence[Features], matches: Matches) -> tuple[Indices, np.ndarray]:
-    """COLMAP's points. -> (T,) point of each keypoint of all references, or -1; (P, 3)"""
-    with tempfile.TemporaryDirectory() as scratch, quietly():
+    """Triangulate with COLMAP. -> (T,) point of each keypoint of all references, or -1; (P, 3)"""
+    with tempfile.TemporaryDirectory() as scratch, silence_colmap():
         database = Path(scratch) / "database.db"
-        model = _prepared(database, references, features, matches)
+        model = _write_database(database, references, features, matches)
         options = pycolmap.IncrementalPipelineOptions(num_threads=1, random_seed=0, extract_colors=False)
         options.mapper.num_threads = 1
         model = pycolmap.triangulate_points(model, database, scratch, scratch, options=options)
@@ -85,19 +85,20 @@ def triangulate(references: Sequence[Reference], features: Sequence[Features], m
     return np.concatenate(points).astype(np.int64), np.array([model.points3D[point].xyz for point in ids]).reshape(-1, 3)
 
 
-def _matched(features: Sequence[Features], pairs: Sequence[tuple[int, int]]) -> Iterable[tuple[tuple[int, int], Indices]]:
+def _match_pairs(features: Sequence[Features], pairs: Sequence[tuple[int, int]]) -> Iterable[tuple[tuple[int, int], Indices]]:
+    """Match mutually nearest descriptors of each pair of references."""
     device = pick_device()
     rows = [torch.from_numpy(each.descriptors).to(device) for each in features]
     with Progress("map: matches", len(pairs)) as progress:
         for a, b in pairs:
-            yield (a, b), np.stack(mutual(points_to_points(rows[a], rows[b]), RATIO), axis=1)
+            yield (a, b), np.stack(find_mutual_nearest(points_to_points(rows[a], rows[b]), RATIO), axis=1)
             progress.advance()
 
 
-def _prepared(
+def _write_database(
     database: Path, references: Sequence[Reference], features: Sequence[Features], matches: Matches
 ) -> pycolmap.Reconstruction:
-    """A model with poses and no point, and a database with what COLMAP triangulates them from. Numbers count from 1."""
+    """Return a model with poses and no points, and fill the database for COLMAP's triangulation. Numbers count from 1."""
     model = pycolmap.Reconstruction()
     with pycolmap.Database.open(database) as opened:
         for number, (reference, each) in enumerate(zip(references, features, strict=True), 1):
@@ -110,14 +111,14 @@ def _prepared(
             opened.write_frame(model.frame(number), use_frame_id=True)
             opened.write_image(model.image(number), use_image_id=True)
             opened.write_keypoints(number, each.keypoints)
-        for (a, b), found in matches.items():
+        for (a, b), rows in matches.items():
             pair = pycolmap.TwoViewGeometry()
             pair.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
-            pair.inlier_matches = found.astype(np.uint32)
+            pair.inlier_matches = rows.astype(np.uint32)
             opened.write_two_view_geometry(a + 1, b + 1, pair)
     return model
 
 
-def _rays(reference: Reference, features: Features) -> np.ndarray:
-    """Where the keypoints lie on the plane at depth one. -> (N, 2) float64"""
+def _compute_rays(reference: Reference, features: Features) -> np.ndarray:
+    """Project the keypoints to the plane at depth one. -> (N, 2) float64"""
     return np.asarray(reference.camera.cam_from_img(features.keypoints.astype(np.float64)))

@@ -1,4 +1,4 @@
-"""The server's map: the keypoints of all references, their descriptors, and the 3D points that they are seen to be."""
+"""The server's map: the keypoints of all references, their descriptors, and the 3D points that they observe."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Map:
     starts: Indices  # (V + 1,) keypoints starts[v] up to starts[v + 1] are of reference v
     keypoints: Floats  # (T, 2)
     descriptors: Floats  # (T, D) unit norm
-    codes: Bytes | None  # (T, D) the 8-bit vectors that the descriptors came from, where there are any
+    codes: Bytes | None  # (T, D) the 8-bit vectors of the descriptors, if there are any
     points: Indices  # (T,) the row of `xyz` that a keypoint is an image of, or -1
     xyz: NDArray[np.float64]  # (P, 3) in the scene's unit of length
 
@@ -32,18 +32,18 @@ class Map:
         return len(self.names)
 
     def rows(self, reference: int) -> slice:
-        """The keypoints of one reference."""
+        """Return the keypoints of one reference."""
         return slice(int(self.starts[reference]), int(self.starts[reference + 1]))
 
     def to_arrays(self) -> tuple[Arrays, dict[str, Any]]:
-        """What a file of tensors holds of it, and its metadata. Descriptors that came from codes are not stored."""
+        """Return arrays and metadata for a tensor file. Descriptors are stored only where there are no codes."""
         arrays: Arrays = {"starts": self.starts, "keypoints": self.keypoints, "points": self.points, "xyz": self.xyz}
         stored: Arrays = {"descriptors": self.descriptors} if self.codes is None else {"codes": self.codes}
         return arrays | stored, {"names": list(self.names)}
 
 
 def from_arrays(arrays: Arrays, meta: Mapping[str, Any]) -> Map:
-    """The map that `to_arrays` took apart."""
+    """Rebuild a map from the result of `to_arrays`."""
     codes = arrays.get("codes")
     return Map(
         names=tuple(meta["names"]),

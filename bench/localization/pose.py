@@ -1,8 +1,8 @@
-"""The pose of a query whose intrinsics are fixed, from matches of its keypoints with points: P3P in LO-RANSAC, then refined.
+"""The pose of a query with fixed intrinsics, from matches of its keypoints with points: P3P in LO-RANSAC, then refined.
 
-PoseLib (Larsson, 2020) makes as many trials as COLMAP in less than half the time, finds as many poses, and says how many trials
-it made. COLMAP caps its trials by `min_inlier_ratio`, in silence, and does not say how many it made: here the ratio is so small
-that the cap is not reached, and all trials that are allowed are made.
+PoseLib (Larsson, 2020) runs as many trials as COLMAP in less than half the time, finds as many poses, and reports its number of
+trials. COLMAP caps its trials by `min_inlier_ratio` without a message, and does not report their number. Here the ratio is so
+small that the cap is never reached, and COLMAP runs all trials allowed.
 """
 
 from __future__ import annotations
@@ -21,115 +21,115 @@ Doubles = NDArray[np.float64]
 Solver = Literal["poselib", "pycolmap"]
 
 MAX_ERROR = 12.0  # pixels of reprojection; COLMAP's and hloc's
-CONFIDENCE = 0.9999  # RANSAC stops when it has missed the best pose with a chance of less than one minus this
-MULTIPLIER = 3.0  # COLMAP's and PoseLib's, of the trials that this asks for
-AT_LEAST = 1000  # trials, if so many are allowed
-LEAST = 4  # matches; P3P takes 3, and the fourth tells its solutions apart
+CONFIDENCE = 0.9999  # RANSAC stops when the chance that it missed the best pose is below one minus this
+MULTIPLIER = 3.0  # COLMAP's and PoseLib's, of the trials that `CONFIDENCE` needs
+MIN_TRIALS = 1000  # if so many are allowed
+MIN_MATCHES = 4  # P3P takes 3, and the fourth selects among its solutions
 NO_CAP = 1e-9  # min_inlier_ratio
-# Models of cameras that PoseLib shares with COLMAP. Those it does not know it takes without a word, and gives nonsense.
-SHARED = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"}
+# Camera models that PoseLib shares with COLMAP. It accepts unknown models without an error, and returns wrong poses.
+POSELIB_MODELS = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"}
 
-ROUNDS = 3  # of fitting a focal length and choosing inliers anew
-MISFIT = 0.05  # of the focal length, that is reported
-EVIDENCE = 100.0  # F, of one parameter more: ten standard errors; a wall that faces the camera reached 51 in the gallery
+ROUNDS = 3  # of fitting a focal length and selecting inliers again
+MIN_FOCAL_MISMATCH = 0.05  # fraction of the focal length
+MIN_F_STATISTIC = 100.0  # of one more parameter: ten standard errors; a wall that faces the camera reached 51 in the gallery
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Estimate:
-    """What RANSAC found of C matches."""
+    """The result of RANSAC on C matches."""
 
     cam_from_world: pycolmap.Rigid3d
     inliers: NDArray[np.bool_]  # (C,)
-    trials: int  # that were made
+    trials: int  # that RANSAC ran
 
 
 def estimate(
     xy: Doubles, xyz: Doubles, camera: pycolmap.Camera, *, trials: int, seed: int, solver: Solver = "poselib"
 ) -> Estimate | None:
-    """The pose that most matches agree with, refined on them; None if there are fewer than `LEAST` matches, or none was found.
+    """Estimate the pose with most inliers, refined on them; None below `MIN_MATCHES` matches, or if RANSAC finds none.
 
     Parameters
     ----------
     xy, xyz : (C, 2) pixels and (C, 3) in the map's unit of length
     trials : at most
-    solver : PoseLib's, unless it does not know the model of the camera; or COLMAP's
+    solver : for a camera model that PoseLib does not know, COLMAP's in any case
 
     Raises
     ------
     UserError
-        if there is no such solver.
+        if the solver is unknown.
     """
     if solver not in get_args(Solver):
         raise unknown_name("solver", solver, get_args(Solver))
-    if len(xy) < LEAST:
+    if len(xy) < MIN_MATCHES:
         return None
-    solve = _poselib if solver == "poselib" and camera.model.name in SHARED else _pycolmap
+    solve = _estimate_with_poselib if solver == "poselib" and camera.model.name in POSELIB_MODELS else _estimate_with_pycolmap
     return solve(xy, xyz, camera, trials, seed)
 
 
-def errors(found: pycolmap.Rigid3d, truth: pycolmap.Rigid3d) -> tuple[float, float]:
-    """How far the camera's centre is off, in the map's unit of length, and by how much it is turned, in degrees."""
-    apart = found.inverse().translation - truth.inverse().translation
-    return float(np.linalg.norm(apart)), float(np.degrees(found.rotation.angle_to(truth.rotation)))
+def compute_errors(estimated: pycolmap.Rigid3d, truth: pycolmap.Rigid3d) -> tuple[float, float]:
+    """Compute the error of the camera's centre, in the map's unit of length, and of its rotation, in degrees."""
+    offset = estimated.inverse().translation - truth.inverse().translation
+    return float(np.linalg.norm(offset)), float(np.degrees(estimated.rotation.angle_to(truth.rotation)))
 
 
-def reprojection(pose: pycolmap.Rigid3d, camera: pycolmap.Camera, xy: Doubles, xyz: Doubles) -> Doubles:
-    """How far each point is from its keypoint, in pixels; infinite behind the camera. -> (C,)"""
-    seen = pose * xyz  # (C, 3)
-    before = seen[:, 2] > 0
-    apart = np.full(len(xy), np.inf)
-    apart[before] = np.linalg.norm(np.asarray(camera.img_from_cam(seen[before])) - xy[before], axis=1)
-    apart[np.isnan(apart)] = np.inf  # what a lens does not map
-    return apart
+def compute_reprojection_errors(pose: pycolmap.Rigid3d, camera: pycolmap.Camera, xy: Doubles, xyz: Doubles) -> Doubles:
+    """Compute the distance from each projected point to its keypoint, in pixels; infinite behind the camera. -> (C,)"""
+    in_camera = pose * xyz  # (C, 3)
+    before = in_camera[:, 2] > 0
+    errors = np.full(len(xy), np.inf)
+    errors[before] = np.linalg.norm(np.asarray(camera.img_from_cam(in_camera[before])) - xy[before], axis=1)
+    errors[np.isnan(errors)] = np.inf  # points outside the lens model's range
+    return errors
 
 
-def misfit(xy: Doubles, xyz: Doubles, camera: pycolmap.Camera, found: Estimate) -> float | None:
-    """The focal length that the inliers ask for, relative to the camera's, if they leave no doubt that it is another.
+def estimate_focal_mismatch(xy: Doubles, xyz: Doubles, camera: pycolmap.Camera, estimated: Estimate) -> float | None:
+    """Estimate the focal length from the inliers, relative to the camera's; None unless the two clearly differ.
 
-    It is set free on the inliers, which are then chosen anew, `ROUNDS` times. There is no doubt if it is off by more than
-    `MISFIT` and its F, the sum of squares that it saves over what is left a degree of freedom, is above `EVIDENCE`. Few matches,
-    and matches on a plane that faces the camera, tell nothing.
+    The focal length is refined on the inliers, which are then selected again, `ROUNDS` times. It clearly differs if it is off by
+    more than `MIN_FOCAL_MISMATCH` and its F statistic is above `MIN_F_STATISTIC`: the sum of squares that it saves, over the rest
+    per degree of freedom. Few matches, and matches on a plane that faces the camera, give None.
     """
-    free, pose, inliers = deepcopy(camera), found.cam_from_world, found.inliers
+    free, pose, inliers = deepcopy(camera), estimated.cam_from_world, estimated.inliers
     options = pycolmap.AbsolutePoseRefinementOptions(refine_focal_length=True)
     for _ in range(ROUNDS):
-        if inliers.sum() < 2 * LEAST:
+        if inliers.sum() < 2 * MIN_MATCHES:
             return None
         refined = pycolmap.refine_absolute_pose(pose, xy, xyz, inliers, free, options)
         if refined is None:
             return None
         pose = refined["cam_from_world"]
-        inliers = reprojection(pose, free, xy, xyz) < MAX_ERROR
+        inliers = compute_reprojection_errors(pose, free, xy, xyz) < MAX_ERROR
     before, after = (
-        (np.minimum(reprojection(each, lens, xy[inliers], xyz[inliers]), MAX_ERROR) ** 2).sum()
-        for each, lens in ((found.cam_from_world, camera), (pose, free))
+        (np.minimum(compute_reprojection_errors(each, lens, xy[inliers], xyz[inliers]), MAX_ERROR) ** 2).sum()
+        for each, lens in ((estimated.cam_from_world, camera), (pose, free))
     )
     ratio = free.mean_focal_length() / camera.mean_focal_length()
-    evidence = (before - after) * (2 * inliers.sum() - 7) / max(after, np.finfo(float).tiny)
-    return ratio if abs(ratio - 1) > MISFIT and evidence > EVIDENCE else None
+    f_statistic = (before - after) * (2 * inliers.sum() - 7) / max(after, np.finfo(float).tiny)
+    return ratio if abs(ratio - 1) > MIN_FOCAL_MISMATCH and f_statistic > MIN_F_STATISTIC else None
 
 
-def _poselib(xy: Doubles, xyz: Doubles, camera: pycolmap.Camera, trials: int, seed: int) -> Estimate | None:
+def _estimate_with_poselib(xy: Doubles, xyz: Doubles, camera: pycolmap.Camera, trials: int, seed: int) -> Estimate | None:
     import poselib
 
     lens = {"model": camera.model.name, "width": camera.width, "height": camera.height, "params": camera.params.tolist()}
     options = {
         "max_reproj_error": MAX_ERROR,
         "max_iterations": trials,
-        "min_iterations": min(AT_LEAST, trials),
+        "min_iterations": min(MIN_TRIALS, trials),
         "success_prob": CONFIDENCE,
         "dyn_num_trials_mult": MULTIPLIER,
         "seed": seed,
     }
-    pose, told = poselib.estimate_absolute_pose(xy, xyz, lens, options, {})
-    inliers = np.array(told["inliers"], dtype=bool)
-    if inliers.sum() < LEAST:
+    pose, report = poselib.estimate_absolute_pose(xy, xyz, lens, options, {})
+    inliers = np.array(report["inliers"], dtype=bool)
+    if inliers.sum() < MIN_MATCHES:
         return None
-    found = pycolmap.Rigid3d(pycolmap.Rotation3d(np.roll(pose.q, -1)), pose.t)
-    return Estimate(cam_from_world=found, inliers=inliers, trials=int(told["iterations"]))
+    cam_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(np.roll(pose.q, -1)), pose.t)
+    return Estimate(cam_from_world=cam_from_world, inliers=inliers, trials=int(report["iterations"]))
 
 
-def _pycolmap(xy: Doubles, xyz: Doubles, camera: pycolmap.Camera, trials: int, seed: int) -> Estimate | None:
+def _estimate_with_pycolmap(xy: Doubles, xyz: Doubles, camera: pycolmap.Camera, trials: int, seed: int) -> Estimate | None:
     options = pycolmap.AbsolutePoseEstimationOptions()
     options.ransac = pycolmap.RANSACOptions(
         max_error=MAX_ERROR,
@@ -139,7 +139,7 @@ def _pycolmap(xy: Doubles, xyz: Doubles, camera: pycolmap.Camera, trials: int, s
         random_seed=seed,
         num_threads=1,
     )
-    told = pycolmap.estimate_and_refine_absolute_pose(xy, xyz, camera, options)
-    if told is None or told["num_inliers"] < LEAST:
+    report = pycolmap.estimate_and_refine_absolute_pose(xy, xyz, camera, options)
+    if report is None or report["num_inliers"] < MIN_MATCHES:
         return None
-    return Estimate(cam_from_world=told["cam_from_world"], inliers=np.array(told["inlier_mask"], dtype=bool), trials=trials)
+    return Estimate(cam_from_world=report["cam_from_world"], inliers=np.array(report["inlier_mask"], dtype=bool), trials=trials)

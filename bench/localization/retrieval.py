@@ -1,7 +1,7 @@
-"""Which references look like a query: bags of words, weighted by tf-idf (Sivic & Zisserman, ICCV 2003).
+"""Retrieval of similar references by bags of words, weighted by tf-idf (Sivic & Zisserman, ICCV 2003).
 
-With the words that raw descriptors quantise to, this is one ranking for all defenses, as the paper's was. With the words that a
-release consists of it leaks nothing beyond the release.
+With the nearest words of raw descriptors, the ranking is the same for all defenses, as in the paper. With the words of a release,
+it leaks nothing beyond the release.
 """
 
 from __future__ import annotations
@@ -24,28 +24,28 @@ class Bags:
 
     words: Indices  # (T,) of the map's keypoints
     starts: Indices  # (V + 1,) as the map's
-    size: int  # words that there are
+    size: int  # words of the dictionary
 
     @cached_property
     def weights(self) -> NDArray[np.float64]:
         """log(V / references with the word), 0 for a word that none has. -> (K,)"""
         count = len(self.starts) - 1
-        seen = np.asarray((self._counts > 0).sum(axis=0)).ravel()  # (K,)
-        return np.where(seen > 0, np.log(count / np.maximum(seen, 1)), 0.0)
+        frequencies = np.asarray((self._counts > 0).sum(axis=0)).ravel()  # (K,)
+        return np.where(frequencies > 0, np.log(count / np.maximum(frequencies, 1)), 0.0)
 
     @cached_property
     def _counts(self) -> scipy.sparse.csr_matrix:
-        """(V, K) how often each reference has each word."""
+        """(V, K) the number of times that each reference has each word."""
         ones = np.ones(len(self.words))
         return scipy.sparse.csr_matrix((ones, self.words, self.starts), shape=(len(self.starts) - 1, self.size))
 
     @cached_property
     def _rows(self) -> scipy.sparse.csr_matrix:
         """(V, K) unit norm."""
-        return _unit(self._counts.multiply(self.weights).tocsr())
+        return _normalize(self._counts.multiply(self.weights).tocsr())
 
     def rank(self, words: Indices, count: int = TOP) -> Indices:
-        """The references whose bags have the greatest cosine to that of a query, ties to the first.
+        """Return the references of greatest cosine to the query's bag, ties to the first.
 
         Parameters
         ----------
@@ -59,6 +59,6 @@ class Bags:
         return np.argsort(-(self._rows @ bag), kind="stable")[:count]
 
 
-def _unit(rows: scipy.sparse.csr_matrix) -> scipy.sparse.csr_matrix:
+def _normalize(rows: scipy.sparse.csr_matrix) -> scipy.sparse.csr_matrix:
     norms = np.sqrt(np.asarray(rows.multiply(rows).sum(axis=1)).ravel())
     return scipy.sparse.diags(1 / np.where(norms > 0, norms, 1)) @ rows

@@ -1,4 +1,4 @@
-"""The server: retrieves references for what a client released, matches it with them, and estimates the client's pose."""
+"""The server: retrieves references for a release, matches the release with them, and estimates the client's pose."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ import pycolmap
 from bench.api import Defense
 from bench.codebook.dictionary import Dictionary
 from bench.codebook.public import REFERENCES, Public
-from bench.core.randomness import randomness
-from bench.geometry.subspaces import guesses
+from bench.core.randomness import derive_generator
+from bench.geometry.subspaces import guess_descriptors
 from bench.localization import map_matching, pose
-from bench.localization.map_matching import Correspondences, Retrieved
+from bench.localization.map_matching import Correspondences, RetrievedReferences
 from bench.localization.pose import Estimate
 from bench.localization.retrieval import TOP
-from bench.localization.scene_index import Place
+from bench.localization.scene_index import SceneIndex
 from bench.registry import spec
-from bench.types import Bytes, Descriptors, Features, Floats, Indices, Release, Subspaces, WordSets
+from bench.types import Bytes, Descriptors, Features, Floats, Indices, Points, Release, Subspaces, WordSets
 
-VOCABULARY = 16_000  # words that retrieval by descriptors uses, if the references have four times as many
-CHECKED = 1000  # trials of RANSAC on raw features, which mostly match rightly
+RETRIEVAL_WORDS = 16_000  # for retrieval by descriptors, if the references have four times as many keypoints
+CHECK_TRIALS = 1000  # of RANSAC on raw features, most of whose matches are correct
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Localized:
-    """What a server found out of one release."""
+class LocalizationResult:
+    """The correspondences and the pose of one release."""
 
     correspondences: Correspondences
     estimate: Estimate | None  # None where there were too few correspondences, or no pose
@@ -34,96 +34,98 @@ class Localized:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Server:
-    """A place that is served to one client."""
+    """The localization service, as one client uses it."""
 
     public: Public
     camera: pycolmap.Camera  # of the client: intrinsics are sent with the release
 
     @property
-    def place(self) -> Place:
-        """Raises ValueError where there is none."""
-        if self.public.place is None:
-            raise ValueError("a server serves a place, and there is none")
-        return self.public.place
+    def scene_index(self) -> SceneIndex:
+        """The index of the server's scene. Raises ValueError if there is none."""
+        if self.public.scene_index is None:
+            raise ValueError("a server needs a scene, and there is none")
+        return self.public.scene_index
 
-    def dictionary(self, defense: Defense) -> Dictionary | None:
-        """That whose words a defense releases, if it has one."""
+    def find_dictionary(self, defense: Defense) -> Dictionary | None:
+        """Return the dictionary whose words a defense releases; None if there is none."""
         if defense.dictionary_field is None:
             return None
         words = 0 if defense.word_count_field is None else getattr(defense, defense.word_count_field)
         return self.public.dictionary(getattr(defense, defense.dictionary_field), words)
 
-    def seen_by(self, query: Features, count: int = TOP) -> Indices:
-        """The references that look most like a query, by its raw descriptors: the same for every defense. -> (count,)"""
-        return self._alike(query.descriptors if query.codes is None else query.codes, count)
+    def retrieve_by_query(self, query: Features, count: int = TOP) -> Indices:
+        """Retrieve the references most similar to a query's raw descriptors: the same for every defense. -> (count,)"""
+        return self._rank_references(query.descriptors if query.codes is None else query.codes, count)
 
-    def seen_in(self, release: Release, defense: Defense, count: int = TOP) -> Indices:
-        """The references that look most like a release, by nothing else than what was released. -> (count,)"""
-        known = self.dictionary(defense)
-        if isinstance(release, WordSets) and release.words is not None and known is not None:
-            return self.place.bags(known).rank(release.words, count)
-        return self._alike(looks(release), count)
+    def retrieve_by_release(self, release: Release, defense: Defense, count: int = TOP) -> Indices:
+        """Retrieve the references most similar to a release, from the release alone. -> (count,)"""
+        dictionary = self.find_dictionary(defense)
+        if isinstance(release, WordSets) and release.words is not None and dictionary is not None:
+            return self.scene_index.build_bags(dictionary).rank(release.words, count)
+        return self._rank_references(extract_descriptors(release), count)
 
     def localize(
         self, release: Release, defense: Defense | None, references: Indices, matcher: str, trials: int, seed: int
-    ) -> Localized:
+    ) -> LocalizationResult:
         """Match a release with references, and estimate the pose of its camera.
 
         Parameters
         ----------
-        defense : that the release is from, for matchers of words or of references that are lifted as well
-        matcher : one of matching.MATCHERS that applies to the release
+        defense : of the release, for matchers that need words or lifted references
+        matcher : one of map_matching.MATCHERS that applies to the release
         trials : of RANSAC, at most
         """
-        how = map_matching.MATCHERS[matcher]()
-        known = self.dictionary(defense) if how.by_words and defense is not None else None
-        retrieved = Retrieved(
-            map=self.place.map,
+        method = map_matching.MATCHERS[matcher]()
+        dictionary = self.find_dictionary(defense) if method.needs_words and defense is not None else None
+        retrieved = RetrievedReferences(
+            map=self.scene_index.map,
             references=references,
-            words=None if known is None else self.place.words(known),
-            lifted=None if defense is None else lambda reference: self._lifted(defense, reference),
+            words=None if dictionary is None else self.scene_index.quantize_map(dictionary),
+            lift=None if defense is None else lambda reference: self._lift_reference(defense, reference),
         )
-        found = how.match(release, retrieved)
-        estimate = pose.estimate(*self._pairs(release, found), self.camera, trials=trials, seed=seed)
-        return Localized(correspondences=found, estimate=estimate)
+        correspondences = method.match(release, retrieved)
+        estimate = pose.estimate(*self._gather_points(release, correspondences), self.camera, trials=trials, seed=seed)
+        return LocalizationResult(correspondences=correspondences, estimate=estimate)
 
-    def misfit(self, query: Features) -> float | None:
-        """The focal length that a query's raw features ask for, relative to the camera's, if it is another beyond doubt."""
-        raw = Descriptors(keypoints=query.keypoints, size=query.size, descriptors=query.descriptors)
-        found = self.localize(raw, None, self.seen_by(query), "mutual-nn", CHECKED, seed=0)
-        if found.estimate is None:
+    def estimate_focal_mismatch(self, query: Features) -> float | None:
+        """Estimate the focal length from a query's raw features, relative to the camera's; None unless they clearly differ."""
+        raw = Descriptors(positions=Points(keypoints=query.keypoints), size=query.size, descriptors=query.descriptors)
+        result = self.localize(raw, None, self.retrieve_by_query(query), "mutual-nn", CHECK_TRIALS, seed=0)
+        if result.estimate is None:
             return None
-        return pose.misfit(*self._pairs(raw, found.correspondences), self.camera, found.estimate)
+        return pose.estimate_focal_mismatch(*self._gather_points(raw, result.correspondences), self.camera, result.estimate)
 
-    def _lifted(self, defense: Defense, reference: int) -> Subspaces:
-        """The keypoints of a reference as that defense releases them: once and for all, whatever the client's seed."""
-        rng = randomness("lifted reference", self.place.digest, reference, spec.configuration(defense, self.public))
-        lifted = defense.protect(self.place.references[reference], self.public, rng)
+    def _lift_reference(self, defense: Defense, reference: int) -> Subspaces:
+        """Lift the keypoints of a reference with that defense. The result does not depend on the client's seed."""
+        rng = derive_generator(
+            "lifted reference", self.scene_index.digest, reference, spec.to_json_with_digests(defense, self.public)
+        )
+        lifted = defense.protect(self.scene_index.reference_features[reference], self.public, rng)
         if not isinstance(lifted, Subspaces):
             raise TypeError(f"{defense.name()} lifts nothing")
         return lifted
 
-    def _pairs(self, release: Release, found: Correspondences) -> tuple[np.ndarray, np.ndarray]:
-        """Pixels and points. -> (C, 2), (C, 3) float64"""
-        return release.keypoints[found.keypoints].astype(np.float64), self.place.map.xyz[found.points]
+    def _gather_points(self, release: Release, pairs: Correspondences) -> tuple[np.ndarray, np.ndarray]:
+        """Gather pixels and points. -> (C, 2), (C, 3) float64"""
+        return release.keypoints[pairs.keypoints].astype(np.float64), self.scene_index.map.xyz[pairs.points]
 
-    def _alike(self, descriptors: Bytes | Floats, count: int) -> Indices:
-        known = self.public.dictionary(REFERENCES, min(VOCABULARY, len(self.place.map.keypoints) // 4))
-        return self.place.bags(known).rank(known.index.nearest(descriptors), count)
+    def _rank_references(self, descriptors: Bytes | Floats, count: int) -> Indices:
+        dictionary = self.public.dictionary(REFERENCES, min(RETRIEVAL_WORDS, len(self.scene_index.map.keypoints) // 4))
+        return self.scene_index.build_bags(dictionary).rank(dictionary.index.find_nearest(descriptors), count)
 
 
-def looks(release: Release) -> Floats:
-    """Descriptors that a release looks like: its own, all candidates, or the best guess of a subspace. -> (R, D)
+def extract_descriptors(release: Release) -> Floats:
+    """Return the descriptors of a release, all its candidates, or the best guess of each subspace. -> (R, D)
 
     Raises
     ------
     TypeError
-        if it is of another kind.
+        if the release is of another type.
     """
     if isinstance(release, Descriptors):
         return release.descriptors
     if isinstance(release, WordSets):
         return release.candidates.reshape(-1, release.candidates.shape[2])
     if isinstance(release, Subspaces):
-        return guesses(release)
-    raise TypeError(f"{type(release).__name__} look like no descriptors")
+        return guess_descriptors(release)
+    raise TypeError(f"{type(release).__name__} holds nothing similar to descriptors")

@@ -1,9 +1,9 @@
-"""Classes drawn with chances whose ratios are integers times powers of e, exactly: no step is rounded.
+"""Exact draws of classes whose chances have ratios of integers times powers of e: no step is rounded.
 
 Pr(class j) = n_j e^(a_j) / Σ_i n_i e^(a_i) for integers n_j ≥ 0 and fractions a_j. A uniform number in [0, 1) falls between two
-of the cumulated chances; both are read bit by bit, as many bits as it takes. A cumulated chance is rational if the classes that
-are not empty have one power, or one lies between none and all of them; else it is irrational, as e to distinct algebraic powers
-are linearly independent over the algebraic numbers (Lindemann and Weierstrass), so that a finite precision tells its digits.
+of the cumulated chances; both are read bit by bit, as many bits as necessary. A cumulated chance is rational if all non-empty
+classes have one power, or if it covers none or all of them. Otherwise it is irrational: e to distinct algebraic powers are
+linearly independent over the algebraic numbers (Lindemann and Weierstrass). A finite precision then determines its digits.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from bench.types import Indices
 
-WIDTH = 64  # bits that are compared in one step
+WIDTH = 64  # bits compared in one step
 
 
 def draw_classes(
@@ -44,19 +44,19 @@ def draw_classes(
     table = [[min(edge, last) for edge in edges(counts, powers, WIDTH)] for counts in profiles]
     first = np.array(table, dtype=np.uint64).reshape(len(profiles), len(powers) - 1)[which]  # (N, J − 1)
     drawn = rng.integers(last, size=len(which), dtype=np.uint64, endpoint=True)
-    chosen = (first < drawn[:, None]).sum(axis=1)
+    classes = (first < drawn[:, None]).sum(axis=1)
     for row in np.flatnonzero((first == drawn[:, None]).any(axis=1)):
-        chosen[row] = _drawn_on(profiles[which[row]], powers, int(drawn[row]), rng)
-    return chosen
+        classes[row] = _refine_draw(profiles[which[row]], powers, int(drawn[row]), rng)
+    return classes
 
 
-def _drawn_on(counts: Sequence[int], powers: Sequence[Fraction], number: int, rng: np.random.Generator) -> int:
-    """The class of a number whose first bits may be those of an edge."""
+def _refine_draw(counts: Sequence[int], powers: Sequence[Fraction], number: int, rng: np.random.Generator) -> int:
+    """Extend a number whose first bits may equal those of an edge, and return its class."""
     bits = WIDTH
-    while number in (found := edges(counts, powers, bits)):
+    while number in (limits := edges(counts, powers, bits)):
         number = number << WIDTH | int(rng.integers(2**WIDTH - 1, dtype=np.uint64, endpoint=True))
         bits += WIDTH
-    return sum(edge < number for edge in found)
+    return sum(edge < number for edge in limits)
 
 
 def edges(counts: Sequence[int], powers: Sequence[Fraction], bits: int) -> list[int]:
@@ -64,53 +64,53 @@ def edges(counts: Sequence[int], powers: Sequence[Fraction], bits: int) -> list[
     filled = [power for count, power in zip(counts, powers, strict=True) if count]
     if len(set(filled)) == 1:
         return [(below << bits) // sum(counts) for below in list(accumulate(counts))[:-1]]
-    top, places = max(filled), bits + 2 * WIDTH
-    relative = tuple(min(power - top, Fraction(0)) for power in powers)  # those above are of empty classes
+    top, precision = max(filled), bits + 2 * WIDTH
+    relative = tuple(min(power - top, Fraction(0)) for power in powers)  # greater powers belong to empty classes
     while True:
-        found = _enclosed(counts, exponentials(relative, places), bits)
-        if found is not None:
-            return found
-        places *= 2
+        limits = _enclose_edges(counts, exponentials(relative, precision), bits)
+        if limits is not None:
+            return limits
+        precision *= 2
 
 
-def _enclosed(counts: Sequence[int], weights: Sequence[tuple[int, int]], bits: int) -> list[int] | None:
-    """The edges, if these bounds of the classes' weights tell them."""
+def _enclose_edges(counts: Sequence[int], weights: Sequence[tuple[int, int]], bits: int) -> list[int] | None:
+    """Return the edges, or None if these bounds of the classes' weights do not determine them."""
     low = list(accumulate(count * least for count, (least, _) in zip(counts, weights, strict=True)))
     high = list(accumulate(count * most for count, (_, most) in zip(counts, weights, strict=True)))
     left = list(accumulate(counts))
-    found = []
-    for place in range(len(counts) - 1):
-        if left[place] in (0, left[-1]):
-            found.append((1 << bits) if left[place] else 0)
+    limits = []
+    for index in range(len(counts) - 1):
+        if left[index] in (0, left[-1]):
+            limits.append((1 << bits) if left[index] else 0)
             continue
-        floor = (low[place] << bits) // (low[place] + high[-1] - high[place])
-        ceiling = (high[place] << bits) // (high[place] + low[-1] - low[place])
-        if floor != min(ceiling, (1 << bits) - 1):  # below 1, though the classes that follow may weigh less than can be seen
+        floor = (low[index] << bits) // (low[index] + high[-1] - high[index])
+        ceiling = (high[index] << bits) // (high[index] + low[-1] - low[index])
+        if floor != min(ceiling, (1 << bits) - 1):  # below 1, although the weight of the next classes may be below the precision
             return None
-        found.append(floor)
-    return found
+        limits.append(floor)
+    return limits
 
 
 @lru_cache(maxsize=256)
-def exponentials(powers: tuple[Fraction, ...], places: int) -> list[tuple[int, int]]:
-    """Integers below and above 2^places · e^a, for each a ≤ 0."""
-    return [_exponential(power, places) for power in powers]
+def exponentials(powers: tuple[Fraction, ...], precision: int) -> list[tuple[int, int]]:
+    """Integers below and above 2^precision · e^a, for each a ≤ 0."""
+    return [_exponential(power, precision) for power in powers]
 
 
-def _exponential(power: Fraction, places: int) -> tuple[int, int]:
-    """`decimal` rounds each operation correctly: with so many digits the product errs by less than 1."""
+def _exponential(power: Fraction, precision: int) -> tuple[int, int]:
+    """One of `exponentials`. `decimal` rounds each operation correctly: with these digits the product errs by less than 1."""
     if power == 0:
-        return 1 << places, 1 << places
-    if -power > places:
-        return 0, 1  # e^-places < 2^-places
-    context = Context(prec=places // 3 + len(str(places)) + 10, Emax=MAX_EMAX, Emin=MIN_EMIN)
+        return 1 << precision, 1 << precision
+    if -power > precision:
+        return 0, 1  # e^-precision < 2^-precision
+    context = Context(prec=precision // 3 + len(str(precision)) + 10, Emax=MAX_EMAX, Emin=MIN_EMIN)
     argument = context.divide(Decimal(power.numerator), Decimal(power.denominator))
-    scaled = int(context.multiply(context.exp(argument), context.power(2, places)))
+    scaled = int(context.multiply(context.exp(argument), context.power(2, precision)))
     return max(0, scaled - 1), scaled + 2
 
 
 def chances(counts: NDArray[np.integer], powers: Sequence[float]) -> NDArray[np.float64]:
-    """The same chances to a double's precision. (..., J), J -> (..., J)"""
+    """The chances to a double's precision. (..., J), J -> (..., J)"""
     with np.errstate(divide="ignore"):
         logs = np.log(counts) + np.array(powers, dtype=float)
     return np.exp(logs - np.logaddexp.reduce(logs, axis=-1, keepdims=True))

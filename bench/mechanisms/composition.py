@@ -1,7 +1,7 @@
-"""What many ε-LDP answers cost together.
+"""Composition of many ε-LDP answers.
 
-N answers, each ε-LDP, are N·ε-LDP (basic composition). Who grants that the promise fails with a chance of δ gets a smaller ε, of
-which the least is known: the optimal composition of Kairouz, Oh and Viswanath (ICML 2015, Theorem 3.3).
+N answers, each ε-LDP, are N·ε-LDP (basic composition). If the guarantee may fail with a chance of δ, ε is smaller. The least such
+ε is the optimal composition of Kairouz, Oh and Viswanath (ICML 2015, Theorem 3.3).
 """
 
 from __future__ import annotations
@@ -15,24 +15,24 @@ from scipy.optimize import brentq
 from scipy.special import gammaln
 
 DELTA = 1e-6
-# What is released of a photograph and covered by no ε.
+# Parts of a release that no ε covers.
 UNCOVERED = ("the keypoints' positions", "the number of keypoints")
-LINKS = "which keypoints share a word"  # in one release and from one to the next, by a defense that remembers
+LINKS = "which keypoints share a word"  # within a release and across releases, for a memoized defense
 
 
-def basic(epsilon: float, answers: int) -> float:
-    """ε of all the answers together, with certainty."""
+def compose_basic(epsilon: float, answers: int) -> float:
+    """Return the ε of all answers together, with certainty."""
     return answers * epsilon if answers else 0.0
 
 
 @lru_cache(maxsize=4096)
-def optimal(epsilon: float, answers: int, delta: float = DELTA) -> float:
-    """The least ε' such that `answers` answers, each ε-LDP, are together (ε', δ)-LDP, whatever they are.
+def compose_optimal(epsilon: float, answers: int, delta: float = DELTA) -> float:
+    """Return the least ε' such that any `answers` answers, each ε-LDP, are together (ε', δ)-LDP.
 
     The worst answers are randomised responses: with P(l) = C(N, l) p^(N − l) q^l, where p = 1 − q = e^ε / (1 + e^ε), and Q(l) the
-    same with p and q exchanged, (ε', δ)-LDP asks that Σ_l max(0, P(l) − e^ε' Q(l)) ≤ δ. The sum is the greatest, over i, of
-    A_i − e^ε' B_i with A_i = P(0) + ... + P(i) and B_i likewise. So ε' is the greatest of ln ((A_i − δ) / B_i). All of it is done
-    in logarithms.
+    same with p and q exchanged, (ε', δ)-LDP requires Σ_l max(0, P(l) − e^ε' Q(l)) ≤ δ. The sum is the greatest, over i, of
+    A_i − e^ε' B_i with A_i = P(0) + ... + P(i) and B_i likewise. So ε' is the greatest of ln ((A_i − δ) / B_i), computed in
+    logarithms.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ def optimal(epsilon: float, answers: int, delta: float = DELTA) -> float:
     delta : from 0, which gives basic composition, up to but not including 1
     """
     if answers == 0 or epsilon == 0 or math.isinf(epsilon) or delta == 0:
-        return basic(epsilon, answers)
+        return compose_basic(epsilon, answers)
     lies = np.arange(answers + 1)
     ways = gammaln(answers + 1) - gammaln(lies + 1) - gammaln(answers - lies + 1)
     truth = -math.log1p(math.exp(-epsilon))  # ln p; ln q is ε less
@@ -53,13 +53,13 @@ def optimal(epsilon: float, answers: int, delta: float = DELTA) -> float:
     return float((left - B[more]).max(initial=0.0))
 
 
-def together(epsilon: float, answers: int, delta: float = DELTA) -> float:
-    """The smaller of the two."""
-    return min(basic(epsilon, answers), optimal(epsilon, answers, delta))
+def compose(epsilon: float, answers: int, delta: float = DELTA) -> float:
+    """Return the smaller ε of basic and optimal composition."""
+    return min(compose_basic(epsilon, answers), compose_optimal(epsilon, answers, delta))
 
 
-def epsilon_left(total: float, answers: int, cost: Callable[[float, int], float] = together) -> float:
-    """The ε of one answer at which all of them, at least 1, together cost `total`."""
+def solve_epsilon(total: float, answers: int, cost: Callable[[float, int], float] = compose) -> float:
+    """Return the ε of one answer at which `answers` of them, at least 1, together cost `total`."""
     if total == 0 or math.isinf(total):
         return total
     return float(brentq(lambda epsilon: cost(epsilon, answers) - total, 0.0, 2 * total + 10, xtol=1e-12, rtol=1e-12))

@@ -1,19 +1,19 @@
-"""How many words to release for a given dictionary and ε: by what a set tells, and by what a server can do with it.
+"""Choice of the subset size for a dictionary and an ε, by two criteria.
 
-1. *Information*: the size at which a set tells most of its word (`bench.mechanisms.subset.information`, exactly).
-2. *Localization*: the size at which RANSAC most likely finds the pose in the trials that it is allowed. The model:
+1. *Information*: the size of greatest mutual information of a set and its word (`bench.mechanisms.subset.mutual_information`).
+2. *Localization*: the size at which RANSAC most likely finds the pose within its trials. The model:
 
-   Of N keypoints, n have the same word as the point that they are of, in one of the retrieved references. Each is told
-   with the probability p of Eq. (5), so that I ~ Binomial(n, p) matches are right. Each of the N m words released is
-   that of R / |K| other points, too, where the references show R: W = N m R / |K| matches are wrong. Of T samples of s = 3
+   Of N keypoints, n have the same word as their point in one of the retrieved references. Each such word is released with the
+   probability p of Eq. (5), so I ~ Binomial(n, p) matches are right. Each of the N m released words is also the word of R / |K|
+   other points, where R points are in the references. So W = N m R / |K| matches are wrong. For T samples of s = 3 matches
 
        1 − (1 − C(I, s) / C(I + W, s))^T
 
-   is the chance that one is all right, and finds the pose. A wrong pose is agreed with by its own sample and Poisson(a W) other
-   matches, a being the chance that a point which is somewhere in the image is within RANSAC's threshold. The pose is kept if more
-   agree with it than with the best of T wrong ones, which is so with probability F(I − s − 1)^T, F being Poisson's distribution.
+   is the chance that one sample has only right matches and yields the pose. A wrong pose has as inliers its own sample and
+   Poisson(a W) other matches; a is the chance that a random point of the image is within RANSAC's threshold. The pose is selected
+   if it has more inliers than each of T wrong poses: with probability F(I − s − 1)^T, F being Poisson's distribution function.
 
-   p / m falls with m, so that the share of right matches is greatest for m = 1; but of fewer right matches, too few may be left.
+   p / m falls with m, so the fraction of right matches is greatest for m = 1, but the number of right matches may be too small.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from bench.core.errors import UserError
-from bench.mechanisms.subset import information, log10_chance, most_accurate_size, most_informative_size
+from bench.mechanisms.subset import log10_chance, most_accurate_size, most_informative_size, mutual_information
 from bench.types import Indices
 
 if TYPE_CHECKING:
@@ -38,40 +38,40 @@ if TYPE_CHECKING:
 Doubles = NDArray[np.float64]
 
 SAMPLE = 3  # matches that P3P takes
-WITHIN = "recall_0.25m_2deg"
-SAME = 5e-4  # between values of ε that are one when they are written with three digits
+RECALL = "recall_0.25m_2deg"
+EPSILON_TOLERANCE = 5e-4  # greatest difference of values of ε that agree to three digits
 
 
 @dataclass(frozen=True, kw_only=True)
-class Service:
-    """What a server has to do with. The defaults are those of the gallery: medians over its queries by day."""
+class Workload:
+    """Parameters of the localization model. The defaults are medians over the gallery's queries by day."""
 
     keypoints: int = 1000  # N, of a query
-    repeated: Sequence[float] = (0.27,)  # n / N, of one query or of several that are averaged
+    repeatability: Sequence[float] = (0.27,)  # n / N, of one query, or of several to average over
     points: int = 5000  # R, of the retrieved references
     trials: int = 30_000  # T
-    agreeing: float = math.pi * 12**2 / (640 * 480)  # a: 12 pixels, in an image of that size
+    agreement: float = math.pi * 12**2 / (640 * 480)  # a: 12 pixels, in an image of that size
 
 
 @dataclass(frozen=True)
-class Choice:
-    """What sets of one size give."""
+class SizeEstimate:
+    """Predictions for sets of one size."""
 
     size: int  # m
-    told: float  # p
-    bits: float  # that a set tells of its word
+    inclusion: float  # p
+    bits: float  # of information in a set about its word
     right: float  # matches of a query that are right, on average
     wrong: float
     success: float  # the chance that RANSAC finds the pose
 
 
-def choices(epsilon: float, domain: int, sizes: Sequence[int], service: Service) -> list[Choice]:
-    """What each size gives.
+def estimate_sizes(epsilon: float, domain: int, sizes: Sequence[int], workload: Workload) -> list[SizeEstimate]:
+    """Predict information and localization for each size.
 
     Raises
     ------
     UserError
-        if a number makes no sense.
+        if a number is out of range.
     """
     if not epsilon >= 0 or math.isinf(epsilon):
         raise UserError(f"--epsilon: must be at least 0 and finite, got {epsilon}")
@@ -79,72 +79,77 @@ def choices(epsilon: float, domain: int, sizes: Sequence[int], service: Service)
         raise UserError(f"--words: a dictionary has at least 2 words, not {domain}")
     if not sizes or not all(0 < size < domain for size in sizes):
         raise UserError(f"--sizes: a set has at least 1 word and fewer than the dictionary's {domain}, got {list(sizes)}")
-    if service.keypoints < 1 or service.points < 0 or service.trials < 1:
+    if workload.keypoints < 1 or workload.points < 0 or workload.trials < 1:
         raise UserError("a query has at least 1 keypoint, references show no negative number of points, RANSAC makes a trial")
-    if not all(0 <= share <= 1 for share in (*service.repeated, service.agreeing)):
-        raise UserError("shares are from 0 to 1")
-    bits = information(epsilon, domain, np.array(sizes)) / math.log(2)
-    return [_choice(epsilon, domain, size, float(told_bits), service) for size, told_bits in zip(sizes, bits, strict=True)]
+    if not all(0 <= fraction <= 1 for fraction in (*workload.repeatability, workload.agreement)):
+        raise UserError("repeatability and agreement must be from 0 to 1")
+    bits = mutual_information(epsilon, domain, np.array(sizes)) / math.log(2)
+    return [
+        _estimate_size(epsilon, domain, size, float(information), workload) for size, information in zip(sizes, bits, strict=True)
+    ]
 
 
-def _choice(epsilon: float, domain: int, size: int, bits: float, service: Service) -> Choice:
-    told = 10 ** log10_chance(epsilon, domain, size)
-    wrong = service.keypoints * size * service.points / domain
-    counts = np.rint(service.keypoints * np.array(service.repeated)).astype(np.int64)
-    found = float(np.mean([success(int(n), told, wrong, service.trials, service.agreeing) for n in counts]))
-    return Choice(size, told, bits, float(counts.mean() * told), wrong, found)
+def _estimate_size(epsilon: float, domain: int, size: int, bits: float, workload: Workload) -> SizeEstimate:
+    inclusion = 10 ** log10_chance(epsilon, domain, size)
+    wrong = workload.keypoints * size * workload.points / domain
+    counts = np.rint(workload.keypoints * np.array(workload.repeatability)).astype(np.int64)
+    chance = float(np.mean([estimate_success(int(n), inclusion, wrong, workload.trials, workload.agreement) for n in counts]))
+    return SizeEstimate(size, inclusion, bits, float(counts.mean() * inclusion), wrong, chance)
 
 
-def success(n: int, told: float, wrong: float, trials: int, agreeing: float) -> float:
-    """The chance that RANSAC finds the pose, by the model at the top of this file. `wrong` is W."""
+def estimate_success(n: int, inclusion: float, wrong: float, trials: int, agreement: float) -> float:
+    """Return the chance that RANSAC finds the pose, by the model at the top of this file. `wrong` is W."""
     right = np.arange(n + 1)
-    return float(stats.binom.pmf(right, n, told) @ (drawn(right, wrong, trials) * kept(right, wrong, trials, agreeing)))
+    return float(
+        stats.binom.pmf(right, n, inclusion)
+        @ (compute_sample_chance(right, wrong, trials) * compute_selection_chance(right, wrong, trials, agreement))
+    )
 
 
-def drawn(right: Indices, wrong: float, trials: int) -> Doubles:
-    """The chance that one of the samples is all right. (I,) -> (I,)"""
+def compute_sample_chance(right: Indices, wrong: float, trials: int) -> Doubles:
+    """Return the chance that one sample has only right matches. (I,) -> (I,)"""
     steps = np.arange(SAMPLE)
-    shares = np.maximum(right[:, None] - steps, 0) / np.maximum(right[:, None] + wrong - steps, 1e-9)
-    hit = np.where(right >= SAMPLE, shares.clip(max=1).prod(axis=1), 0.0)
+    ratios = np.maximum(right[:, None] - steps, 0) / np.maximum(right[:, None] + wrong - steps, 1e-9)
+    hit = np.where(right >= SAMPLE, ratios.clip(max=1).prod(axis=1), 0.0)
     with np.errstate(divide="ignore"):
         return -np.expm1(trials * np.log1p(-hit))
 
 
-def kept(right: Indices, wrong: float, trials: int, agreeing: float) -> Doubles:
-    """The chance that more matches agree with the pose than with any of the wrong ones. (I,) -> (I,)"""
-    return np.exp(trials * stats.poisson.logcdf(right - SAMPLE - 1, wrong * agreeing))
+def compute_selection_chance(right: Indices, wrong: float, trials: int, agreement: float) -> Doubles:
+    """Return the chance that the pose has more inliers than any wrong pose. (I,) -> (I,)"""
+    return np.exp(trials * stats.poisson.logcdf(right - SAMPLE - 1, wrong * agreement))
 
 
-def measured(
+def collect_recalls(
     records: Sequence[Mapping[str, Any]], epsilon: float, domain: int, trials: int, condition: str
 ) -> tuple[dict[int, list[float]], list[float]]:
-    """What was measured by localization with `ldp`: of each size whether each query was localized; and n / N of each query.
+    """Collect localization results with `ldp`: per size, whether each query was localized; and n / N of each query.
 
-    The latter is how many matches of a query were right when nothing was hidden, with ε = ∞ and m = 1 and the same dictionary.
+    n / N is the fraction of a query's matches that are right without a guarantee: with ε = ∞, m = 1 and the same dictionary.
 
     Raises
     ------
     UserError
         if there is neither.
     """
-    found: dict[int, list[float]] = {}
-    repeated = []
+    recalls: dict[int, list[float]] = {}
+    repeatability = []
     for record in records:
         defense = record["defense"]
-        if not _is_told(record, trials, condition) or defense["name"] != "ldp" or defense["words"] != domain:
+        if not _is_comparable(record, trials, condition) or defense["name"] != "ldp" or defense["words"] != domain:
             continue
-        told = float(defense["epsilon"])
-        if math.isinf(told) and defense["subset_size"] == 1:
-            repeated.append(record["metrics"]["inliers"] / record["metrics"]["keypoints"])
-        elif abs(told - epsilon) < SAME:
-            found.setdefault(defense["subset_size"], []).append(record["metrics"][WITHIN])
-    if not found and not repeated:
-        raise UserError(f"--results: no localization with ldp:epsilon={epsilon:g} or inf, words={domain} is there")
-    return found, repeated
+        value = float(defense["epsilon"])
+        if math.isinf(value) and defense["subset_size"] == 1:
+            repeatability.append(record["metrics"]["inliers"] / record["metrics"]["keypoints"])
+        elif abs(value - epsilon) < EPSILON_TOLERANCE:
+            recalls.setdefault(defense["subset_size"], []).append(record["metrics"][RECALL])
+    if not recalls and not repeatability:
+        raise UserError(f"--results: no localization with ldp:epsilon={epsilon:g} or inf, words={domain} found")
+    return recalls, repeatability
 
 
-def _is_told(record: Mapping[str, Any], trials: int, condition: str) -> bool:
-    """Whether it is of a query under that condition, with what serves the release best, and so many trials."""
+def _is_comparable(record: Mapping[str, Any], trials: int, condition: str) -> bool:
+    """Whether the record is of a query under that condition, with the default matcher and so many trials."""
     settings = record.get("task_settings") or {}
     return (
         record["task"] == "localization"
@@ -156,8 +161,8 @@ def _is_told(record: Mapping[str, Any], trials: int, condition: str) -> bool:
     )
 
 
-def report(rows: Sequence[Choice], epsilon: float, domain: int, recalls: dict[int, list[float]]) -> Iterator[Text | Table]:
-    """The choices as people read them."""
+def report(rows: Sequence[SizeEstimate], epsilon: float, domain: int, recalls: dict[int, list[float]]) -> Iterator[Text | Table]:
+    """Yield the predictions as terminal output."""
     from rich.table import Table
     from rich.text import Text
 
@@ -165,20 +170,21 @@ def report(rows: Sequence[Choice], epsilon: float, domain: int, recalls: dict[in
     table = Table(
         title=Text(f"Sets of m of {domain} words at ε = {epsilon:g}"),
         caption=Text(
-            f"‡ RANSAC finds the pose most likely * tells most of its word: m = {most_informative_size(epsilon, domain)} "
-            f"† tells most of how frequent words are: m = {most_accurate_size(epsilon, domain)}"
+            f"‡ RANSAC finds the pose most likely * most information about its word: m = "
+            f"{most_informative_size(epsilon, domain)} "
+            f"† most accurate word frequencies: m = {most_accurate_size(epsilon, domain)}"
         ),
         title_justify="left",
         caption_justify="left",
     )
-    columns = ["m", "Pr(true)", "bits told", "right matches", "wrong matches", "Pr(pose found)"]
+    columns = ["m", "Pr(true)", "bits", "right matches", "wrong matches", "Pr(pose found)"]
     for column in [*columns, *(["measured"] if recalls else [])]:
         table.add_column(column, justify="right")
-    marks = {most_accurate_size(epsilon, domain): " †", most_informative_size(epsilon, domain): " *"}
+    symbols = {most_accurate_size(epsilon, domain): " †", most_informative_size(epsilon, domain): " *"}
     for row in rows:
-        mark = marks.get(row.size, "") + (" ‡" if row.size == best else "")
-        cells = [f"{row.told:.4g}", f"{row.bits:.3g}", f"{row.right:.4g}", f"{row.wrong:.4g}", f"{row.success:.3f}"]
-        shares = recalls.get(row.size)
-        seen = [] if not recalls else [f"{np.mean(shares):.3f} of {len(shares)}" if shares else "n/a"]
-        table.add_row(f"{row.size}{mark}", *cells, *seen)
+        symbol = symbols.get(row.size, "") + (" ‡" if row.size == best else "")
+        cells = [f"{row.inclusion:.4g}", f"{row.bits:.3g}", f"{row.right:.4g}", f"{row.wrong:.4g}", f"{row.success:.3f}"]
+        values = recalls.get(row.size)
+        measured = [] if not recalls else [f"{np.mean(values):.3f} of {len(values)}" if values else "n/a"]
+        table.add_row(f"{row.size}{symbol}", *cells, *measured)
     yield table

@@ -1,1 +1,1 @@
-"""Plugins: discovery, specs written as text, fields, the listing, templates for new ones."""
+"""Plugins: discovery, specs as text, fields, and templates for new plugins."""

@@ -1,4 +1,4 @@
-"""Writes a small package with a plugin of one's own, and with a test of the contract that it must keep."""
+"""Writes a small package with a new plugin and a test of its contract."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from bench.registry.discovery import Kind
 
 TEMPLATES = Path(__file__).parent / "templates"
 KINDS: dict[str, Kind] = {
-    kind.word: kind
+    kind.name: kind
     for kind in (
         discovery.DEFENSE,
         discovery.ATTACK,
@@ -27,40 +27,40 @@ KINDS: dict[str, Kind] = {
 NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
 
 
-def write(word: str, name: str, out: Path) -> list[Path]:
+def write(kind: str, name: str, out: Path) -> list[Path]:
     """Write the package into the new folder `out`, and return its files.
 
     Raises
     ------
     UserError
-        if there is no such kind of plugin, the name cannot be one, is taken, or `out` holds something already.
+        if the kind is unknown, the name is invalid or taken, or `out` is not empty.
     """
-    if word not in KINDS:
-        raise unknown_name("kind of plugin", word, KINDS)
+    if kind not in KINDS:
+        raise unknown_name("kind of plugin", kind, KINDS)
     module = name.replace("-", "_")
     if not NAME.fullmatch(name) or keyword.iskeyword(module):
-        raise UserError(f"{name!r} cannot be a plugin's name: write small letters, digits and - between words")
-    taken = discovery.discover(KINDS[word])
-    if name in taken:
-        raise UserError(f"there is a {word} called {name!r} already: {taken[name].origin}")
+        raise UserError(f"{name!r} is not a valid plugin name: use small letters, digits, and - between words")
+    existing = discovery.discover(KINDS[kind])
+    if name in existing:
+        raise UserError(f"a {kind} named {name!r} exists already: {existing[name].origin}")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise UserError(f"{out}: exists already; name a new folder")
-    words = {
-        "kind": word,
+        raise UserError(f"{out}: exists already; give a new folder")
+    values = {
+        "kind": kind,
         "name": name,
         "module": module,
         "title": "".join(part.capitalize() for part in name.split("-")),
-        "group": KINDS[word].group,
+        "group": KINDS[kind].group,
         "version": version("feature-privacy-bench"),
     }
-    texts = {
+    files = {
         "pyproject.toml": "pyproject.toml",
         "README.md": "README.md",
-        f"{module}.py": f"{word}.py",
-        f"tests/test_{module}.py": f"tests/{word}.py",
+        f"{module}.py": f"{kind}.py",
+        f"tests/test_{module}.py": f"tests/{kind}.py",
     }
-    for path, template in texts.items():
+    for path, template in files.items():
         (out / path).parent.mkdir(parents=True, exist_ok=True)
-        written = Template((TEMPLATES / f"{template}.txt").read_text(encoding="utf-8")).substitute(words)
-        (out / path).write_text(written, encoding="utf-8")
-    return [out / path for path in texts]
+        text = Template((TEMPLATES / f"{template}.txt").read_text(encoding="utf-8")).substitute(values)
+        (out / path).write_text(text, encoding="utf-8")
+    return [out / path for path in files]

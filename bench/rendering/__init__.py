@@ -1,1 +1,1 @@
-"""Pictures of flat textured surfaces, from cameras whose poses are exact."""
+"""Rendering of flat textured surfaces, from cameras with exact poses."""

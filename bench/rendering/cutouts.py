@@ -1,6 +1,6 @@
-"""Cut-outs of people, to stand in the foreground: drawn ones, each with clothes of its own, and three from photographs.
+"""Cut-outs of people for the foreground: drawn ones, each in different clothes, and three from photographs.
 
-Those who appear in the map and those who appear in queries have nothing in common: other draws, other photographs.
+People in the map and people in queries differ: other draws, other photographs.
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from bench.images.photographs import decode, of_people
-from bench.rendering.artworks import blobs, glyphs, mosaic
-from bench.rendering.noise import colour, colours, fractal, pixels
+from bench.images.photographs import decode, list_people
+from bench.rendering.artworks import draw_blobs, draw_text, draw_mosaic
+from bench.rendering.noise import to_colour, draw_palette, draw_noise, pixels
 from bench.types import Bytes, Floats
 
 TALL, WIDE = 480, 224  # pixels of a cut-out
@@ -42,7 +42,7 @@ ADMIRAL = (
 
 @dataclass(frozen=True, eq=False)
 class Person:
-    """A picture of somebody and where it is opaque."""
+    """A picture of a person with its opacity."""
 
     pixels: Bytes  # (h, w, 3)
     opacity: Floats  # (h, w) 0 to 1
@@ -55,42 +55,42 @@ class Person:
         return self.tall * w / h
 
 
-def of_map(rng: np.random.Generator, count: int) -> list[Person]:
-    """People who are in reference views."""
-    _, cameraman, _ = (np.asarray(decode(source.path)[0]) for source in of_people())
+def create_map_people(rng: np.random.Generator, count: int) -> list[Person]:
+    """Create the people of reference views."""
+    _, cameraman, _ = (np.asarray(decode(source.path)[0]) for source in list_people())
     sepia = pixels(cameraman * np.array([1.0, 0.93, 0.82]))
-    return [_cut(sepia, CAMERAMAN, tall=1.5), *(drawn(rng) for _ in range(count - 1))]
+    return [_cut_out(sepia, CAMERAMAN, tall=1.5), *(draw_person(rng) for _ in range(count - 1))]
 
 
-def of_queries(rng: np.random.Generator, count: int) -> list[Person]:
-    """People who are in query views."""
-    astronaut, _, admiral = (np.asarray(decode(source.path)[0]) for source in of_people())
-    # Each of them twice, in other trousers: theirs are the faces by which one sees what an attack recovers.
-    busts = [_standing(rng, *who) for who in ((astronaut, ASTRONAUT, 196), (admiral, ADMIRAL, 140)) for _ in range(2)]
-    return busts + [drawn(rng) for _ in range(count - len(busts))]
+def create_query_people(rng: np.random.Generator, count: int) -> list[Person]:
+    """Create the people of query views."""
+    astronaut, _, admiral = (np.asarray(decode(source.path)[0]) for source in list_people())
+    # Each twice, in other trousers: photographed faces show what an attack recovers.
+    busts = [_stand_bust(rng, *bust) for bust in ((astronaut, ASTRONAUT, 196), (admiral, ADMIRAL, 140)) for _ in range(2)]
+    return busts + [draw_person(rng) for _ in range(count - len(busts))]
 
 
-def drawn(rng: np.random.Generator) -> Person:
-    """Somebody made up, from head to shoes."""
+def draw_person(rng: np.random.Generator) -> Person:
+    """Draw a person from head to shoes."""
     canvas, opacity = np.zeros((TALL, WIDE, 3), np.uint8), np.zeros((TALL, WIDE), np.uint8)
-    _legs(rng, canvas, opacity, top=250)
-    skin = colour(np.array([236.0, 192.0, 162.0]) * rng.uniform(0.4, 1.0))
-    _torso(rng, canvas, opacity, skin)
-    _head(rng, canvas, opacity, skin)
-    return _person(rng, canvas, opacity, rng.uniform(1.6, 1.85))
+    _draw_legs(rng, canvas, opacity, top=250)
+    skin = to_colour(np.array([236.0, 192.0, 162.0]) * rng.uniform(0.4, 1.0))
+    _draw_torso(rng, canvas, opacity, skin)
+    _draw_head(rng, canvas, opacity, skin)
+    return _create_person(rng, canvas, opacity, rng.uniform(1.6, 1.85))
 
 
-def _person(rng: np.random.Generator, canvas: Bytes, opacity: Bytes, tall: float) -> Person:
-    folds = 1 + 0.1 * fractal(rng, canvas.shape[:2], 60, 5, 0.7)
-    return Person(pixels(canvas * folds[..., None]), _share(opacity), tall)
+def _create_person(rng: np.random.Generator, canvas: Bytes, opacity: Bytes, tall: float) -> Person:
+    folds = 1 + 0.1 * draw_noise(rng, canvas.shape[:2], 60, 5, 0.7)
+    return Person(pixels(canvas * folds[..., None]), _scale_opacity(opacity), tall)
 
 
-def _share(opacity: Bytes) -> Floats:
-    """0 to 255 -> 0 to 1"""
+def _scale_opacity(opacity: Bytes) -> Floats:
+    """Scale 0 to 255 to 0 to 1."""
     return (opacity / 255).astype(np.float32)
 
 
-def _paint(canvas: Bytes, opacity: Bytes, outline: list[tuple[float, float]], cloth: Bytes | Ink) -> None:
+def _fill(canvas: Bytes, opacity: Bytes, outline: list[tuple[float, float]], cloth: Bytes | Ink) -> None:
     """Fill a closed, rounded outline with a cloth."""
     points = np.array(outline, np.float32)
     shape = np.zeros(opacity.shape, np.uint8)
@@ -103,31 +103,31 @@ def _paint(canvas: Bytes, opacity: Bytes, outline: list[tuple[float, float]], cl
     np.maximum(opacity, shape, out=opacity)
 
 
-def _cloth(rng: np.random.Generator) -> Bytes:
-    """Plain, striped, checked, printed or flowered. -> (TALL, WIDE, 3)"""
+def _draw_cloth(rng: np.random.Generator) -> Bytes:
+    """Draw a plain, striped, checked, printed or flowered cloth. -> (TALL, WIDE, 3)"""
     size = TALL, WIDE
-    first, second = colours(rng, 2, (0.1, 0.9))
+    first, second = draw_palette(rng, 2, (0.1, 0.9))
     y, x = np.mgrid[:TALL, :WIDE]
     stripe = int(rng.integers(6, 22))
     match rng.integers(6):
         case 0:
-            return pixels(first + 4 * fractal(rng, size, 4, 2)[..., None])
+            return pixels(first + 4 * draw_noise(rng, size, 4, 2)[..., None])
         case 1:
             return np.where(((y // stripe) % 2 == 0)[..., None], first, second).astype(np.uint8)
         case 2:
             return pixels((first * ((y // stripe) % 2)[..., None] + second * ((x // stripe) % 2)[..., None]) / 2 + 40)
         case 3:
             cloth = np.full((*size, 3), first, np.uint8)
-            cloth[115:195, 72:152] = glyphs(rng, (80, 80)) if rng.random() < 0.5 else blobs(rng, (80, 80))
+            cloth[115:195, 72:152] = draw_text(rng, (80, 80)) if rng.random() < 0.5 else draw_blobs(rng, (80, 80))
             return cloth
         case 4:
-            return blobs(rng, size)
+            return draw_blobs(rng, size)
         case _:
-            return mosaic(rng, size)
+            return draw_mosaic(rng, size)
 
 
-def _torso(rng: np.random.Generator, canvas: Bytes, opacity: Bytes, skin: Ink) -> None:
-    cloth = _cloth(rng)
+def _draw_torso(rng: np.random.Generator, canvas: Bytes, opacity: Bytes, skin: Ink) -> None:
+    cloth = _draw_cloth(rng)
     slim = rng.uniform(0.82, 1.1)
 
     def at(x: float, y: float) -> tuple[float, float]:
@@ -147,30 +147,32 @@ def _torso(rng: np.random.Generator, canvas: Bytes, opacity: Bytes, skin: Ink) -
             (56 + swing * 0.4, 190),
             (40, 130),
         ]
-        _paint(canvas, opacity, [at(side * x, y) for x, y in sleeve], cloth)
+        _fill(canvas, opacity, [at(side * x, y) for x, y in sleeve], cloth)
     trunk = [(-18, 74), (18, 74), (52, 86), (58, 120), (48, 190), (52, 268), (-52, 268), (-48, 190), (-58, 120), (-52, 86)]
-    _paint(canvas, opacity, [at(x, y) for x, y in trunk], cloth)
+    _fill(canvas, opacity, [at(x, y) for x, y in trunk], cloth)
 
 
-def _legs(rng: np.random.Generator, canvas: Bytes, opacity: Bytes, top: int) -> None:
-    cloth = pixels(colours(rng, 1, (0.05, 0.5))[0] * rng.uniform(0.2, 0.8) + 5 * fractal(rng, (TALL, WIDE), 4, 2)[..., None])
+def _draw_legs(rng: np.random.Generator, canvas: Bytes, opacity: Bytes, top: int) -> None:
+    cloth = pixels(
+        draw_palette(rng, 1, (0.05, 0.5))[0] * rng.uniform(0.2, 0.8) + 5 * draw_noise(rng, (TALL, WIDE), 4, 2)[..., None]
+    )
     middle = WIDE / 2
     for side in (-1, 1):
         stride = rng.uniform(4, 26)
         leg = [(0, top), (50, top), (48 + stride * 0.4, 360), (38 + stride, 458), (12 + stride, 458), (10 + stride * 0.3, 360)]
         shoe = [(10 + stride, 452), (40 + stride, 452), (54 + stride, 476), (10 + stride, 476)]
-        _paint(canvas, opacity, [(middle + side * x, y) for x, y in shoe], colour(colours(rng, 1)[0] * 0.4))
-        _paint(canvas, opacity, [(middle + side * x, y) for x, y in leg], cloth)
+        _fill(canvas, opacity, [(middle + side * x, y) for x, y in shoe], to_colour(draw_palette(rng, 1)[0] * 0.4))
+        _fill(canvas, opacity, [(middle + side * x, y) for x, y in leg], cloth)
 
 
-def _head(rng: np.random.Generator, canvas: Bytes, opacity: Bytes, skin: Ink) -> None:
+def _draw_head(rng: np.random.Generator, canvas: Bytes, opacity: Bytes, skin: Ink) -> None:
     x, y = WIDE // 2, 42
-    hair = colour(np.array([120.0, 84.0, 52.0]) * rng.uniform(0.15, 1.5))
+    hair = to_colour(np.array([120.0, 84.0, 52.0]) * rng.uniform(0.15, 1.5))
     for layer, ink in ((canvas, hair), (opacity, 255)):
         cv2.ellipse(layer, (x, y - 4), (29, 36 + int(rng.integers(0, 3))), 0, 0, 360, ink, -1, cv2.LINE_AA)
         cv2.rectangle(layer, (x - 11, y + 20), (x + 11, y + 42), skin if layer is canvas else 255, -1)
     cv2.ellipse(canvas, (x, y + 5), (23, 31), 0, 0, 360, skin, -1, cv2.LINE_AA)
-    dark = colour(np.array(skin) * 0.35)
+    dark = to_colour(np.array(skin) * 0.35)
     for side in (-1, 1):
         cv2.ellipse(canvas, (x + 9 * side, y + 1), (5, 3), 0, 0, 360, (240, 240, 240), -1, cv2.LINE_AA)
         cv2.circle(canvas, (x + 9 * side, y + 1), 2, (30, 25, 20), -1, cv2.LINE_AA)
@@ -182,27 +184,27 @@ def _head(rng: np.random.Generator, canvas: Bytes, opacity: Bytes, skin: Ink) ->
             cv2.circle(canvas, (x + 9 * side, y + 1), 7, (20, 20, 20), 1, cv2.LINE_AA)
 
 
-def _cut(photograph: Bytes, outline: tuple[tuple[int, int], ...], tall: float) -> Person:
-    """What lies inside the outline, cropped to it."""
+def _cut_out(photograph: Bytes, outline: tuple[tuple[int, int], ...], tall: float) -> Person:
+    """Cut out the inside of the outline, cropped to it."""
     points = np.array(outline)
     opacity = np.zeros(photograph.shape[:2], np.uint8)
     cv2.fillPoly(opacity, [points], 255, cv2.LINE_AA)
     (left, top), (right, bottom) = points.min(axis=0), points.max(axis=0) + 1
     area = slice(top, bottom), slice(left, right)
-    return Person(np.ascontiguousarray(photograph[area]), _share(opacity[area]), tall)
+    return Person(np.ascontiguousarray(photograph[area]), _scale_opacity(opacity[area]), tall)
 
 
-def _standing(rng: np.random.Generator, photograph: Bytes, outline: tuple[tuple[int, int], ...], wide: int) -> Person:
-    """A photographed bust, `wide` pixels wide, upon drawn legs."""
-    bust = _cut(photograph, outline, tall=0.0)
+def _stand_bust(rng: np.random.Generator, photograph: Bytes, outline: tuple[tuple[int, int], ...], wide: int) -> Person:
+    """Put a photographed bust, `wide` pixels wide, on drawn legs."""
+    bust = _cut_out(photograph, outline, tall=0.0)
     h, w = bust.opacity.shape
     tall = round(h * wide / w)
     canvas, opacity = np.zeros((TALL, WIDE, 3), np.uint8), np.zeros((TALL, WIDE), np.uint8)
-    _legs(rng, canvas, opacity, top=tall - 20)
+    _draw_legs(rng, canvas, opacity, top=tall - 20)
     left = (WIDE - wide) // 2
     area = slice(0, tall), slice(left, left + wide)
-    shown = cv2.resize(bust.opacity, (wide, tall), interpolation=cv2.INTER_AREA)
-    solid = shown > 0.5
+    bust_opacity = cv2.resize(bust.opacity, (wide, tall), interpolation=cv2.INTER_AREA)
+    solid = bust_opacity > 0.5
     canvas[area][solid] = cv2.resize(bust.pixels, (wide, tall), interpolation=cv2.INTER_AREA)[solid]
     opacity[area][solid] = 255
-    return Person(canvas, _share(opacity), tall=1.78)
+    return Person(canvas, _scale_opacity(opacity), tall=1.78)

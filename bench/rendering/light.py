@@ -1,6 +1,6 @@
-"""How bright each place of a scene is: lamps and the sun with shadows, and the light from all around, gathered by rays.
+"""Lighting of a scene: lamps and the sun with shadows, and ambient light sampled by rays.
 
-The light that walls return is taken to be the same everywhere in a room; corners, and what stands close to something, are darker.
+The light that walls reflect is the same everywhere in a room. Corners, and points close to other surfaces, are darker.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from bench.rendering.raster import Doubles, Mask
 from bench.types import Floats
 
 RAYS = 32  # around each point
-REACH = 1.5  # metres: something farther away than this shines as much as a room does
-BLOCK = 1 << 18  # intersections at a time, so that they stay in the cache
-FAINT = 0.015  # of what a lamp gives at one metre: less is left out
-OFF = 2e-3  # metres from the surface that a ray starts
+REACH = 1.5  # metres: surfaces farther away give the full light of a room
+BLOCK = 1 << 18  # intersections per block, so that they fit the processor's cache
+MIN_STRENGTH = 0.015  # of a lamp's light at one metre: less is ignored
+OFFSET = 2e-3  # metres from the surface to the start of a ray
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,15 +24,15 @@ class Lamp:
     """A point that shines in all directions."""
 
     at: tuple[float, float, float]  # metres
-    colour: tuple[float, float, float]  # what falls upon a surface that faces it at one metre
+    colour: tuple[float, float, float]  # light on a surface that faces it at one metre
 
 
 @dataclass(frozen=True, kw_only=True)
 class Lighting:
-    """All that shines."""
+    """All light sources."""
 
     lamps: tuple[Lamp, ...]
-    sun: tuple[float, float, float]  # what falls upon a surface that faces the sun
+    sun: tuple[float, float, float]  # light on a surface that faces the sun
     towards_sun: tuple[float, float, float]
     sky: tuple[float, float, float]  # the light of the sky, all around
     bounce: tuple[float, float, float]  # the light of a room, all around
@@ -56,7 +56,7 @@ class Occluders:
         return cls(*rows)
 
     def distance(self, origins: Floats, directions: Floats) -> Floats:
-        """How far each ray goes before it meets something, in units of its direction, or infinity. (n, 3), (n, 3) -> (n,)"""
+        """Return the distance of each ray to the first quad, in units of its direction, or infinity. (n, 3), (n, 3) -> (n,)"""
         step = max(1, BLOCK // len(self.corner))
         parts = [self._distance(origins[i : i + step], directions[i : i + step]) for i in range(0, max(1, len(origins)), step)]
         return np.concatenate(parts)
@@ -71,27 +71,29 @@ class Occluders:
         return np.where(hit, away, np.inf).min(axis=1)
 
 
-def fall(points: Floats, normals: Floats, occluders: Occluders, lightings: tuple[Lighting, ...]) -> list[Floats]:
-    """What falls upon points of surfaces under each lighting. points, normals (n, 3) -> [(n, 3)]
+def compute_light(points: Floats, normals: Floats, occluders: Occluders, lightings: tuple[Lighting, ...]) -> list[Floats]:
+    """Compute the light on points of surfaces under each lighting. points, normals (n, 3) -> [(n, 3)]
 
-    All lightings share the rays that go all around.
+    The ambient rays are traced once for all lightings.
     """
-    starts = points + OFF * normals
-    seen = _gather(starts, normals, occluders)
-    found = []
+    starts = points + OFFSET * normals
+    ambient = _compute_ambient_light(starts, normals, occluders)
+    results = []
     for lighting in lightings:
-        total = seen @ np.array([lighting.sky, lighting.bounce])
+        total = ambient @ np.array([lighting.sky, lighting.bounce])
         sun = np.broadcast_to(100 * np.array(lighting.towards_sun, np.float32), points.shape)
-        total += _from(starts, normals, occluders, sun, far=True).astype(np.float64) * np.array(lighting.sun)
+        total += _compute_direct_light(starts, normals, occluders, sun, far=True).astype(np.float64) * np.array(lighting.sun)
         for lamp in lighting.lamps:
             towards = np.array(lamp.at, np.float32) - starts
-            total += _from(starts, normals, occluders, towards, far=False).astype(np.float64) * np.array(lamp.colour)
-        found.append(total.astype(np.float32))
-    return found
+            total += _compute_direct_light(starts, normals, occluders, towards, far=False).astype(np.float64) * np.array(
+                lamp.colour
+            )
+        results.append(total.astype(np.float32))
+    return results
 
 
-def _gather(starts: Floats, normals: Floats, occluders: Occluders) -> Floats:
-    """The share of the sky, and of the lit room, that each point sees. (n, 3) -> (n, 2)"""
+def _compute_ambient_light(starts: Floats, normals: Floats, occluders: Occluders) -> Floats:
+    """Compute the fractions of the sky, and of the lit room, visible from each point. (n, 3) -> (n, 2)"""
     turns = np.arange(RAYS) * np.pi * (3 - np.sqrt(5))
     radius = np.sqrt((np.arange(RAYS) + 0.5) / RAYS)  # so that rays are as dense as the cosine is large
     local = np.stack([radius * np.cos(turns), radius * np.sin(turns), np.sqrt(1 - radius**2)], axis=1).astype(np.float32)
@@ -99,22 +101,22 @@ def _gather(starts: Floats, normals: Floats, occluders: Occluders) -> Floats:
     first = np.cross(helper, normals)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     second = np.cross(normals, first)
-    shares = np.zeros((len(starts), 2), np.float32)
+    fractions = np.zeros((len(starts), 2), np.float32)
     for a, b, c in local:
         direction = a * first + b * second + c * normals
         away = occluders.distance(starts, direction)
         outside = np.isinf(away)
-        shares[:, 0] += outside & (direction[:, 2] > 0)
-        shares[:, 1] += np.where(outside, 0.4, np.minimum(away, REACH) / REACH)
-    return (shares / RAYS).astype(np.float32)
+        fractions[:, 0] += outside & (direction[:, 2] > 0)
+        fractions[:, 1] += np.where(outside, 0.4, np.minimum(away, REACH) / REACH)
+    return (fractions / RAYS).astype(np.float32)
 
 
-def _from(starts: Floats, normals: Floats, occluders: Occluders, towards: Floats, far: bool) -> Floats:
-    """Lambert's cosine over the squared distance (or not, from far away), 0 in shadow. -> (n, 1)"""
+def _compute_direct_light(starts: Floats, normals: Floats, occluders: Occluders, towards: Floats, far: bool) -> Floats:
+    """Compute Lambert's cosine, over the squared distance unless the source is far; 0 in shadow. -> (n, 1)"""
     away = np.linalg.norm(towards, axis=1)
     cosine = (normals * towards).sum(axis=1) / away
     strength = np.where(cosine > 0, cosine if far else cosine / np.maximum(away, 0.3) ** 2, 0)
-    strength[strength < FAINT] = 0
+    strength[strength < MIN_STRENGTH] = 0
     lit = np.flatnonzero(strength)
     shadowed = lit[occluders.distance(starts[lit], towards[lit]) < 1]
     strength[shadowed] = 0

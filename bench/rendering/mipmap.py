@@ -1,4 +1,4 @@
-"""Textures with their mip-maps, sampled between two levels (Williams, SIGGRAPH 1983), so that nothing far away aliases."""
+"""Textures with mip-maps, sampled between two levels against aliasing (Williams, SIGGRAPH 1983)."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Texture:
 
     @classmethod
     def of(cls, pixels: Bytes) -> Texture:
-        """(h, w, 3) uint8 -> a texture"""
+        """Build a texture from (h, w, 3) uint8."""
         levels = [pixels]
         while min(levels[-1].shape[:2]) >= 2 * SMALLEST:
             h, w = levels[-1].shape[:2]
@@ -35,7 +35,7 @@ class Texture:
         return h * w
 
     def sample(self, u: Floats, v: Floats, fineness: Floats) -> Floats:
-        """Linear light at (u, v), each from 0 to 1 over the texture; `fineness` is the level, where 0 is the finest.
+        """Sample linear light at (u, v), each from 0 to 1 over the texture; `fineness` is the level, where 0 is the finest.
 
         u, v, fineness (n,) -> (n, 3)
         """
@@ -43,16 +43,16 @@ class Texture:
         whole = level.astype(np.int32)
         values = np.empty((len(u), 3), np.float32)
         for index in np.flatnonzero(np.bincount(whole)).tolist():
-            chosen = np.flatnonzero(whole == index)
-            fine = sample(self.levels[index], u[chosen], v[chosen])
-            coarse = sample(self.levels[min(index + 1, len(self.levels) - 1)], u[chosen], v[chosen])
-            share = (level[chosen] - index)[:, None]
-            values[chosen] = fine + share * (coarse - fine)
+            rows = np.flatnonzero(whole == index)
+            fine = sample(self.levels[index], u[rows], v[rows])
+            coarse = sample(self.levels[min(index + 1, len(self.levels) - 1)], u[rows], v[rows])
+            fraction = (level[rows] - index)[:, None]
+            values[rows] = fine + fraction * (coarse - fine)
         return values
 
 
-def decoded(pixels: Bytes) -> Floats:
-    """Display-encoded values as linear light, 0 to 1."""
+def to_linear(pixels: Bytes) -> Floats:
+    """Convert display-encoded values to linear light, 0 to 1."""
     return _LINEAR[pixels]
 
 
@@ -60,7 +60,7 @@ _LINEAR = ((np.arange(256) / 255.0) ** GAMMA).astype(np.float32)
 
 
 def sample(image: np.ndarray, u: Floats, v: Floats) -> Floats:
-    """Bilinear values at (u, v), each from 0 to 1 over the image; uint8 is decoded to linear light.
+    """Sample bilinearly at (u, v), each from 0 to 1 over the image; uint8 is converted to linear light.
 
     image (h, w, c) uint8 or float32; u, v (n,) -> (n, c)
     """
@@ -75,4 +75,4 @@ def sample(image: np.ndarray, u: Floats, v: Floats) -> Floats:
     maps = x.reshape(rows, ROW), y.reshape(rows, ROW)
     found = cv2.remap(image, *maps, interpolation=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     values: np.ndarray = found.reshape(rows * ROW, -1)[:count]
-    return decoded(values) if image.dtype == np.uint8 else values
+    return to_linear(values) if image.dtype == np.uint8 else values

@@ -31,7 +31,7 @@ class Room:
     def perimeter(self) -> float:
         return 2 * sum(self.size)
 
-    def holds(self, x: float, y: float, margin: float = 0.0) -> bool:
+    def contains(self, x: float, y: float, margin: float = 0.0) -> bool:
         return self.west + margin <= x <= self.east - margin and self.south + margin <= y <= self.north - margin
 
 
@@ -83,27 +83,27 @@ class Wall:
         """Into the room."""
         return np.cross(-UP, self.along)
 
-    def at(self, along: float, height: float, out: float = 0.0) -> Doubles:
-        """The point so far along the wall, at a height above the floor, `out` from the wall into the room."""
+    def point_at(self, along: float, height: float, out: float = 0.0) -> Doubles:
+        """Return the point `along` the wall, at a height above the floor, `out` from the wall into the room."""
         floor = self.corner - UP * self.corner[2]
         return floor + self.along * along + UP * height + self.normal * out
 
     def pieces(self) -> list[tuple[float, float, float, float]]:
-        """The wall without its openings, as rectangles (from, to, bottom, top)."""
-        found, start = [], 0.0
+        """Return the wall without its openings, as rectangles (from, to, bottom, top)."""
+        rectangles, start = [], 0.0
         for left, right, high in sorted(self.openings):
-            found += [(start, left, 0.0, self.room.height), (left, right, high, self.room.height)]
+            rectangles += [(start, left, 0.0, self.room.height), (left, right, high, self.room.height)]
             start = right
-        return [*found, (start, self.length, 0.0, self.room.height)]
+        return [*rectangles, (start, self.length, 0.0, self.room.height)]
 
-    def free(self) -> list[tuple[float, float]]:
-        """The stretches between openings and corners, where things can hang or stand."""
+    def free_stretches(self) -> list[tuple[float, float]]:
+        """Return the stretches between openings and corners, free for pictures and furniture."""
         edges = [0.0, *(edge for left, right, _ in sorted(self.openings) for edge in (left, right)), self.length]
         return list(zip(edges[::2], edges[1::2], strict=True))
 
 
-def walls(room: Room) -> list[Wall]:
-    """The north, east, south and west wall of a room."""
+def list_walls(room: Room) -> list[Wall]:
+    """List the north, east, south and west wall of a room."""
     h = room.height
     sides = (
         ((room.west, room.north, h), (1.0, 0.0, 0.0), room.size[0]),
@@ -111,10 +111,10 @@ def walls(room: Room) -> list[Wall]:
         ((room.east, room.south, h), (-1.0, 0.0, 0.0), room.size[0]),
         ((room.west, room.south, h), (0.0, 1.0, 0.0), room.size[1]),
     )
-    return [_wall(room, np.array(corner), np.array(along), length) for corner, along, length in sides]
+    return [_create_wall(room, np.array(corner), np.array(along), length) for corner, along, length in sides]
 
 
-def _wall(room: Room, corner: Doubles, along: Doubles, length: float) -> Wall:
+def _create_wall(room: Room, corner: Doubles, along: Doubles, length: float) -> Wall:
     normal = np.cross(-UP, along)
     openings = []
     for door in DOORS:

@@ -1,4 +1,4 @@
-"""Where cameras stand and where they look: reference walks around each room, and queries beside those walks."""
+"""Positions and directions of cameras: references on walks around each room, and queries beside those walks."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from bench.rendering.raster import Doubles
 from bench.rendering.rooms import Room
 
 LAPS = 2  # the first looks outwards at the walls nearby, the second across the room
-MARGIN = 0.45  # metres that a camera keeps from things
-NEAREST = 0.9  # metres: a view that looks at something nearer is not taken
+MARGIN = 0.45  # metres from cameras to walls and furniture
+NEAREST = 0.9  # metres: views of nearer surfaces are rejected
 TRIES = 200
 
 
 @dataclass(frozen=True, kw_only=True)
 class Station:
-    """A place and a direction."""
+    """The position and direction of a camera."""
 
     x: float  # metres
     y: float
@@ -44,9 +44,9 @@ class Station:
         return np.stack([turned, np.cross(forward, turned), forward])
 
 
-def on_walk(room: Room, lap: int, share: float) -> Station:
-    """The station at `share` of the way around a room, 0 to 1."""
-    turn = 2 * np.pi * share
+def compute_station(room: Room, lap: int, fraction: float) -> Station:
+    """Compute the station at a fraction of the way around a room, 0 to 1."""
+    turn = 2 * np.pi * fraction
     # A rounded rectangle, halfway between the middle of the room and its walls.
     x, y = (np.sign(value) * abs(value) ** 0.7 for value in (np.cos(turn), np.sin(turn)))
     reach = 0.55 if lap == 0 else 0.72
@@ -61,50 +61,52 @@ def on_walk(room: Room, lap: int, share: float) -> Station:
     )
 
 
-def references(rooms: tuple[Room, ...], count: int, building: Building, seed: int) -> Iterator[tuple[Room, int, Station]]:
-    """`count` stations, shared among the rooms by their perimeters, in the order in which they are walked, with room and lap."""
+def generate_references(
+    rooms: tuple[Room, ...], count: int, building: Building, seed: int
+) -> Iterator[tuple[Room, int, Station]]:
+    """Generate `count` stations in walking order, with room and lap, divided among the rooms by their perimeters."""
     edges = np.cumsum([0.0, *(room.perimeter for room in rooms for _ in range(LAPS))])
     numbers = np.round(edges / edges[-1] * count).astype(int)
     for stretch, (first, last) in enumerate(pairwise(numbers)):
         room, lap = rooms[stretch // LAPS], stretch % LAPS
         for number in range(first, last):
             rng = np.random.default_rng([seed, 5, number])
-            planned = on_walk(room, lap, (number - first + 0.5) / (last - first))
-            yield room, lap, _beside(rng, planned, building, spread=0.15)
+            planned = compute_station(room, lap, (number - first + 0.5) / (last - first))
+            yield room, lap, _find_free_station(rng, planned, building, spread=0.15)
 
 
-def queries(
+def generate_queries(
     rooms: tuple[Room, ...], count: int, building: Building, seed: int, viewpoint: float
 ) -> Iterator[tuple[Room, Station]]:
-    """`count` stations anywhere beside the walks; `viewpoint` scales how far."""
+    """Generate `count` stations beside the walks; `viewpoint` scales their distance from the walks."""
     weights = np.array([room.perimeter for room in rooms])
     for number in range(count):
         rng = np.random.default_rng([seed, 6, number])
         room = rooms[rng.choice(len(rooms), p=weights / weights.sum())]
-        planned = on_walk(room, int(rng.integers(LAPS)), rng.random())
-        yield room, _beside(rng, planned, building, spread=viewpoint)
+        planned = compute_station(room, int(rng.integers(LAPS)), rng.random())
+        yield room, _find_free_station(rng, planned, building, spread=viewpoint)
 
 
-def _beside(rng: np.random.Generator, planned: Station, building: Building, spread: float) -> Station:
-    """A station near the planned one that is free and has a view."""
+def _find_free_station(rng: np.random.Generator, planned: Station, building: Building, spread: float) -> Station:
+    """Find a free station with a view near the planned one."""
     for attempt in range(TRIES):
-        wide = spread + attempt / 40  # where the walk is blocked, look farther and farther around
-        place = planned.centre + rng.normal(0, 1, 3) * wide * np.array([0.7, 0.7, 0.12])
-        found = Station(
-            x=float(place[0]),
-            y=float(place[1]),
-            z=float(np.clip(place[2], 1.2, 1.9)),
+        wide = spread + attempt / 40  # if the walk is blocked, search farther away
+        position = planned.centre + rng.normal(0, 1, 3) * wide * np.array([0.7, 0.7, 0.12])
+        station = Station(
+            x=float(position[0]),
+            y=float(position[1]),
+            z=float(np.clip(position[2], 1.2, 1.9)),
             heading=planned.heading + rng.normal(0, 0.35) * wide,
             pitch=float(np.clip(rng.normal(0.02, 0.06) * wide, -0.35, 0.35)),
             roll=float(np.clip(rng.normal(0, 0.035) * wide, -0.15, 0.15)),
         )
-        if building.free(found.x, found.y, MARGIN) and _has_view(found, building):
-            return found
-    raise AssertionError("no free place near the walk; the floor plan leaves room everywhere")
+        if building.is_free(station.x, station.y, MARGIN) and _has_view(station, building):
+            return station
+    raise AssertionError("no free position near the walk; the floor plan leaves room everywhere")
 
 
 def _has_view(station: Station, building: Building) -> bool:
-    """Whether nothing fills the view from close by."""
+    """Whether no near surface fills the view."""
     x, y = np.meshgrid(np.linspace(-0.5, 0.5, 5), np.linspace(-0.35, 0.35, 3))
     rays = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1) @ station.rotation
     starts = np.broadcast_to(station.centre, rays.shape)

@@ -1,7 +1,7 @@
-"""What lies in a run's folder beside its records: the plan, pictures, what broke, and who is at work.
+"""The files of a run's folder beside its records: the plan, pictures, tracebacks, and the running jobs.
 
-`bench status` is told by these files alone. `plan.json` is the last that was asked of the folder. `running.json` says what is
-in hand; that its writer lives is told by the lock on the records, which the system lifts whenever a process ends.
+`bench status` reads these files alone. `plan.json` is the last plan of the folder. `running.json` lists the jobs that run; the lock
+on the records tells whether their process lives, for the system lifts it when a process ends.
 """
 
 from __future__ import annotations
@@ -20,79 +20,94 @@ from bench.core.errors import UserError
 from bench.runner.records import Record, key
 
 if TYPE_CHECKING:
-    from bench.runner.engines import Job
+    from bench.runner.engines.base import Job
     from bench.runner.plan import Plan
     from bench.runner.trial import Result
 
 ERRORS = "errors.log"
 PLAN = "plan.json"
 RUNNING = "running.json"
-KEPT = ("task", "defense", "attack", "dataset", "seed", "cell_id", "run_hash")  # of a cell's head
+METADATA = ("task", "defense", "attack", "dataset", "seed", "experiment_id", "run_hash")  # of an experiment, in the plan's file
 
 
 def reconstruction_path(out: Path, record: Record) -> Path:
-    """Where the reconstruction of a record is kept."""
-    return out / "reconstructions" / record["cell_id"] / f"{record['unit']}.png"
+    """Return the path of a record's reconstruction. Records of schema 1 have theirs under `cell_id`."""
+    return out / "reconstructions" / str(record.get("cell_id", record["experiment_id"])) / f"{record['sample']}.png"
 
 
-def write_result(made: Result, out: Path) -> None:
-    """Write what belongs to a record, before the record itself.
+def photograph_path(out: Path, record: Record) -> Path:
+    """Return the path of a record's photograph as it was attacked; by content, as datasets may share names."""
+    content = record["dataset"]["hash"].removeprefix("sha256:")[:16]
+    return out / "photographs" / content / f"{record['sample']}.png"
+
+
+def write_result(result: Result, out: Path) -> None:
+    """Write the files that belong to a record, before the record itself.
 
     Raises
     ------
     OSError
-        if it cannot be written.
+        if one cannot be written.
     """
-    if made.picture is not None:
-        path = reconstruction_path(out, made.record)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(made.picture)
-    if made.trace is not None:
+    for content, path in (
+        (result.reconstruction, reconstruction_path(out, result.record)),
+        (result.photograph, photograph_path(out, result.record)),
+    ):
+        if content is not None:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(content)
+    if result.trace is not None:
         with (out / ERRORS).open("a", encoding="utf-8") as log:
-            log.write(f"{made.record['unit']}\n{made.trace}\n")
+            log.write(f"{result.record['sample']}\n{result.trace}\n")
 
 
 def write_plan(out: Path, plans: Sequence[Plan]) -> None:
-    """Write down what is to be done.
+    """Write the plans.
 
     Raises
     ------
     OSError
-        if it cannot be written.
+        if the file cannot be written.
     """
-    written = [
+    content = [
         {
-            "units": [unit.name for unit in plan.samples],
-            "cells": [{name: cell.metadata[name] for name in KEPT} | {"reason": cell.reason} for cell in plan.experiments],
+            "samples": [sample.name for sample in plan.samples],
+            "experiments": [
+                {name: experiment.metadata[name] for name in METADATA} | {"reason": experiment.reason}
+                for experiment in plan.experiments
+            ],
         }
         for plan in plans
     ]
-    _replace(out / PLAN, written)
+    _replace(out / PLAN, content)
 
 
 def read_plan(out: Path) -> list[dict[str, Any]]:
-    """What was written down.
+    """Read the plans.
 
     Raises
     ------
     UserError
-        if there is none, or it is damaged.
+        if there are none, or the file is damaged or of version 0.1.
     """
     path = out / PLAN
     try:
-        return json.loads(path.read_bytes())
+        plans = json.loads(path.read_bytes())
     except FileNotFoundError:
         raise UserError(f"{path}: no such file; nothing was run there") from None
     except ValueError as error:
-        raise UserError(f"{path}: no JSON ({error}); run what was run there again, and it is written anew") from None
+        raise UserError(f"{path}: no JSON ({error}); repeat the run, and it is written anew") from None
+    if not all("experiments" in plan and "samples" in plan for plan in plans):
+        raise UserError(f"{path}: written by another version of this program; repeat the run, and it is written anew")
+    return plans
 
 
 class RunningJobs:
-    """The jobs in hand, in a file that is there while there are any."""
+    """The jobs that run, in a file that exists while there are any."""
 
     def __init__(self, out: Path, engine: str) -> None:
         self._path = out / RUNNING
-        self._who = {"host": socket.gethostname(), "pid": os.getpid(), "engine": engine, "since": time.time()}
+        self._writer = {"host": socket.gethostname(), "pid": os.getpid(), "engine": engine, "since": time.time()}
         self._jobs: dict[tuple[str, str], None] = {}
 
     def __enter__(self) -> Self:
@@ -102,24 +117,24 @@ class RunningJobs:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         self._path.unlink(missing_ok=True)
 
-    def taken(self, jobs: Iterable[Job]) -> Iterator[Job]:
-        """The jobs, each noted when it is taken."""
+    def track(self, jobs: Iterable[Job]) -> Iterator[Job]:
+        """Yield the jobs, and note each when it is taken."""
         for job in jobs:
             self._jobs[job.key] = None
             self._write()
             yield job
 
-    def done(self, record: Record) -> None:
-        """That job is in hand no more."""
+    def remove(self, record: Record) -> None:
+        """Remove the job of that record."""
         self._jobs.pop(key(record), None)
 
     def _write(self) -> None:
-        with contextlib.suppress(OSError):  # it is for people, and no result depends on it
-            _replace(self._path, self._who | {"jobs": list(self._jobs)})
+        with contextlib.suppress(OSError):  # it informs people, and no result depends on it
+            _replace(self._path, self._writer | {"jobs": list(self._jobs)})
 
 
 def read_running(out: Path) -> dict[str, Any] | None:
-    """Who is at work, or was when it ended without notice; None if nobody."""
+    """Read which process writes, or wrote when it ended without notice; None if none did."""
     try:
         return json.loads((out / RUNNING).read_bytes())
     except (OSError, ValueError):
@@ -127,7 +142,7 @@ def read_running(out: Path) -> dict[str, Any] | None:
 
 
 def _replace(path: Path, value: Any) -> None:
-    """In one step: whoever reads sees the old or the new."""
+    """Write in one step: a reader sees the old or the new content."""
     unfinished = path.with_name(f"{path.name}.{os.getpid()}.unfinished")
     unfinished.write_text(json.dumps(value, allow_nan=False), encoding="utf-8")
     unfinished.replace(path)

@@ -1,7 +1,8 @@
-"""Releases that other users of a service would send: what an attacker with OTHER_RELEASES has.
+"""Releases that other users of a service would send: the knowledge `OtherReleases`.
 
-Their photographs are imitated by random windows, half of them mirrored, of the dataset's other photographs. So there are as many
-as wanted; they come back to the same few motifs, but each is lifted afresh, and an attack looks for what liftings share.
+Other users' photographs are imitated by random windows, half of them mirrored, of the dataset's other photographs. So there is no
+limit to their number. They show the same few motifs again and again, but each is lifted anew, and attacks look for what liftings
+have in common.
 """
 
 from __future__ import annotations
@@ -20,15 +21,15 @@ from bench.core.errors import SampleError
 from bench.images.photographs import SIDE, Source, decode
 from bench.types import Bytes, Release
 
-LARGEST = 640  # pixels of the short side that windows are cut from
+LARGEST = 640  # pixels of the short side of the image that windows are cut from
 
 
-class OtherReleases:
-    """An endless list of releases of one defense, the k-th a function of (randomness, k) alone, each made once.
+class ReleasePool:
+    """An endless list of releases of one defense. The k-th is a function of (randomness, k) alone and computed once.
 
     Parameters
     ----------
-    randomness : from a name and k to a generator
+    derive : from a name and k to a generator
     """
 
     def __init__(
@@ -37,41 +38,41 @@ class OtherReleases:
         extractor: Extractor,
         defense: Defense,
         public: Public,
-        randomness: Callable[..., np.random.Generator],
+        derive: Callable[..., np.random.Generator],
     ) -> None:
         self._sources, self._extractor, self._defense, self._public = sources, extractor, defense, public
-        self._randomness = randomness
-        self._made: dict[int, Release | None] = {}
+        self._derive = derive
+        self._releases: dict[int, Release | None] = {}
 
     def without(self, photograph: str) -> Callable[[int], Iterator[Release]]:
-        """The list as the attacker of one photograph has it: with no window of that photograph."""
+        """Return a function from a number to the first so many releases that show no window of that photograph."""
 
         def first(count: int) -> Iterator[Release]:
-            usable = [place for place, source in enumerate(self._sources) if source.name != photograph]
-            turns = (turn * len(self._sources) + place for turn in itertools.count() for place in usable)
-            return itertools.islice(self._releases(turns, len(usable)), count)
+            usable = [number for number, source in enumerate(self._sources) if source.name != photograph]
+            numbers = (turn * len(self._sources) + number for turn in itertools.count() for number in usable)
+            return itertools.islice(self._iterate(numbers, len(usable)), count)
 
         return first
 
-    def _releases(self, turns: Iterator[int], usable: int) -> Iterator[Release]:
-        """What can be made, until as many in a row as there are photographs cannot."""
+    def _iterate(self, numbers: Iterator[int], usable: int) -> Iterator[Release]:
+        """Yield releases, until as many windows in a row as there are photographs have no keypoint."""
         missing = 0
         while missing < usable:
-            k = next(turns)
-            if k not in self._made:
-                self._made[k] = self._make(k)
-            release = self._made[k]
+            k = next(numbers)
+            if k not in self._releases:
+                self._releases[k] = self._protect(k)
+            release = self._releases[k]
             missing = missing + 1 if release is None else 0
             if release is not None:
                 yield release
 
-    def _make(self, k: int) -> Release | None:
+    def _protect(self, k: int) -> Release | None:
         try:
-            pixels = random_window(self._sources[k % len(self._sources)], self._randomness("window", k))
+            pixels = random_window(self._sources[k % len(self._sources)], self._derive("window", k))
             secret = self._extractor.extract(pixels)
         except SampleError:
             return None
-        return self._defense.protect(secret, self._public, self._randomness("release", k))
+        return self._defense.protect(secret, self._public, self._derive("release", k))
 
 
 def random_window(source: Source, rng: np.random.Generator) -> Bytes:

@@ -1,49 +1,30 @@
-"""Runs defenses against attacks on photographs: plans the cells, resumes, survives failures, and yields records.
-
-Every attack sees the same release, and a resumed run gives what an uninterrupted one gives, whoever carries it out.
-"""
+"""Plans: the experiments and samples of a run, with the configuration and the hashes that their records hold."""
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-from bench.api import Attack, Dataset, Defense, Execute, Extractor, Metric, Plugin, Privacy, Task, execute_in_process
+from bench.api import Attack, Dataset, Defense, Extractor, Metric, Plugin, Privacy
 from bench.cache import feature_cache
 from bench.codebook.public import Public
 from bench.core import environment, hashing
 from bench.core.errors import UserError
-from bench.extractors.sift import Sift
 from bench.images.samples import Images, Sample
-from bench.localization.scene_index import Place
+from bench.localization.scene_index import SceneIndex
 from bench.registry import discovery, fields, spec
-from bench.runner import directory, engines, records, trial
-from bench.runner.engines import Engine, Job
+from bench.runner import records
 from bench.runner.records import EVERY_SAMPLE, Record
-from bench.runner.trial import Result, Trials
-from bench.tasks.reconstruction import Reconstruction
-from bench.types import Knowledge
+from bench.task_api import Execute, Task, execute_in_process
+from bench.threat_model import ServerMap
 
 Describe = Callable[[Iterable[object]], Mapping[str, Any]]  # from plugins to the environment that they run in
 
 
-@dataclass(frozen=True, eq=False)
-class Experiment:
-    """One defense against one attack."""
-
-    defense: Defense
-    attack: Attack | None
-    privacy: Privacy
-    metadata: Record  # what all its records begin with
-    reason: str | None  # why it does not apply, if it does not
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RunConfiguration:
-    """What a plan is made from. Can be pickled, so that other processes make the same plan."""
+    """The configuration of a run. It can be pickled, so that other processes build the same plan."""
 
     pairs: tuple[tuple[Defense, Attack | None], ...]
     images: Images
@@ -51,109 +32,62 @@ class RunConfiguration:
     extractor: Extractor
     dataset: Dataset | None
     seed: int
-    metrics: tuple[Metric, ...] = ()  # beside those that need nothing
+    metrics: tuple[Metric, ...] = ()  # beside those that need no setting
+
+
+@dataclass(frozen=True, eq=False)
+class Experiment:
+    """One defense × one attack × one dataset."""
+
+    defense: Defense
+    attack: Attack | None
+    privacy: Privacy
+    metadata: Record  # the part that all its records share
+    reason: str | None  # why it does not apply; None if it does
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """Everything that a run will do, checked as far as it can be without doing it."""
+    """All experiments and samples of a run."""
 
     configuration: RunConfiguration
     task: Task
     experiments: tuple[Experiment, ...]
     samples: tuple[Sample, ...]
-    hashes: Mapping[str, str]  # unit's name -> its content's hash
+    hashes: Mapping[str, str]  # sample's name -> its content's hash
     extractor: Extractor
     metrics: tuple[Metric, ...]
     public: Public
     seed: int
-    execute: Execute = execute_in_process  # where attacks are carried out
+    execute: Execute = execute_in_process  # of attacks
 
     @property
     def hash(self) -> str:
-        """Of configuration and inputs."""
-        return hashing.short_hash(sorted(cell.metadata["cell_id"] for cell in self.experiments))
+        """Hash of configuration and inputs."""
+        return hashing.short_hash(sorted(experiment.metadata["experiment_id"] for experiment in self.experiments))
 
     @property
     def needs_map(self) -> bool:
-        """Whether some cell will ask for the place's map."""
-        return self.task.needs_map or any(
-            cell.attack is not None and Knowledge.MAP in cell.attack.needs for cell in self.experiments
-        )
+        """Whether some experiment asks for the server's map."""
+        attacks = (experiment.attack for experiment in self.experiments if experiment.attack is not None)
+        return self.task.needs_map or any(ServerMap in attack.needs for attack in attacks)
 
     def __len__(self) -> int:
         """The number of its records."""
-        return sum(1 for _ in self.record_keys())
+        return sum(1 for _ in self.list_record_keys())
 
-    def record_keys(self) -> Iterator[tuple[str, str]]:
-        """What its records are known by, `run_hash` and unit, in order."""
-        for place, unit in enumerate(self.samples):
-            for cell in self.experiments:
-                if cell.reason is None:
-                    yield cell.metadata["run_hash"], unit.name
-                elif place == 0:  # what holds for every unit comes with the first
-                    yield cell.metadata["run_hash"], EVERY_SAMPLE
-
-
-def run(
-    defenses: Sequence[Defense],
-    attacks: Sequence[Attack] = (),
-    images: Images = None,
-    *,
-    extractor: Extractor | None = None,
-    task: Task | None = None,
-    dataset: Dataset | None = None,
-    seed: int = 0,
-    metrics: Sequence[Metric] = (),
-    out: Path | str | None = None,
-) -> list[Record]:
-    """Run every defense against every attack, and return one record for each unit, such as a photograph, of each pair.
-
-    Parameters
-    ----------
-    defenses, attacks : plugins, such as `[LDP(epsilon=10)]` and `[DIA()]`
-    images : a folder, files or sources, or None for the built-in photographs
-    extractor : `Sift()` if None
-    task : `Reconstruction()` if None
-    dataset : the place that it is about, for a task that is about one
-    seed : of everything random. A release whose seed is known is for measuring and protects nobody.
-    metrics : those that must be told something, such as a file, beside all that need not be
-    out : a folder to keep records and reconstructions in; what it holds already is not done again
-
-    Raises
-    ------
-    UserError
-        if something is wrong with what was asked; nothing has been written then.
-    """
-    plan = prepare(defenses, attacks, images, extractor=extractor, task=task, dataset=dataset, seed=seed, metrics=metrics)
-    return sort_records([plan], execute([plan], None if out is None else Path(out)))
-
-
-def prepare(
-    defenses: Sequence[Defense],
-    attacks: Sequence[Attack] = (),
-    images: Images = None,
-    *,
-    extractor: Extractor | None = None,
-    task: Task | None = None,
-    dataset: Dataset | None = None,
-    seed: int = 0,
-    metrics: Sequence[Metric] = (),
-) -> Plan:
-    """Check what was asked, and lay out what is to be done. Parameters as those of `run`.
-
-    Raises
-    ------
-    UserError
-        if something is wrong with it, or no pair of it applies.
-    """
-    task = task or Reconstruction()
-    pairs = cross(task, defenses, attacks)
-    return prepare_pairs(pairs, images, extractor=extractor, task=task, dataset=dataset, seed=seed, metrics=metrics)
+    def list_record_keys(self) -> Iterator[tuple[str, str]]:
+        """Yield the keys of its records, `run_hash` and sample, in order."""
+        for number, sample in enumerate(self.samples):
+            for experiment in self.experiments:
+                if experiment.reason is None:
+                    yield experiment.metadata["run_hash"], sample.name
+                elif number == 0:  # one record stands for all samples
+                    yield experiment.metadata["run_hash"], EVERY_SAMPLE
 
 
 def cross(task: Task, defenses: Sequence[Defense], attacks: Sequence[Attack] = ()) -> tuple[tuple[Defense, Attack | None], ...]:
-    """Every defense with every attack, or with None where the task judges the release itself.
+    """Pair every defense with every attack, or with None where the task evaluates the release itself.
 
     Raises
     ------
@@ -166,180 +100,78 @@ def cross(task: Task, defenses: Sequence[Defense], attacks: Sequence[Attack] = (
         raise UserError(f"{task.name()} needs an attack")
     if not task.judges_attacks and attacks:
         raise UserError(f"{task.name()} judges the release itself and takes no attack")
-    tried: Sequence[Attack | None] = attacks or [None]
-    return tuple((defense, attack) for defense in defenses for attack in tried)
+    candidates: Sequence[Attack | None] = attacks or [None]
+    return tuple((defense, attack) for defense in defenses for attack in candidates)
 
 
-def prepare_pairs(
-    pairs: Sequence[tuple[Defense, Attack | None]],
-    images: Images = None,
-    *,
-    task: Task,
-    extractor: Extractor | None = None,
-    dataset: Dataset | None = None,
-    seed: int = 0,
-    metrics: Sequence[Metric] = (),
-) -> Plan:
-    """As `prepare`, for these pairs of a defense and an attack instead of all; None where the task judges the release itself.
+def build_plan(configuration: RunConfiguration, describe: Describe = environment.describe) -> Plan:
+    """Build the plan of a run. `describe` returns the environment in which it will be executed.
 
     Raises
     ------
     UserError
-        as `prepare`.
+        if something is wrong with the configuration.
     """
-    asked = RunConfiguration(
-        pairs=tuple(pairs),
-        images=images,
-        task=task,
-        extractor=extractor or Sift(),
-        dataset=dataset,
-        seed=seed,
-        metrics=tuple(metrics),
-    )
-    return prepared(asked)
-
-
-def prepared(asked: RunConfiguration, describe: Describe = environment.describe) -> Plan:
-    """The plan, once a keypoint was protected by each of its defenses, so that a user's mistake shows before anything is written.
-
-    Raises
-    ------
-    UserError
-        as `prepare`.
-    """
-    plan = planned(asked, describe)
-    if all(cell.reason for cell in plan.experiments):
-        raise UserError("nothing to run: " + "; ".join(sorted({str(cell.reason) for cell in plan.experiments})))
-    Trials(plan).rehearse()
-    return plan
-
-
-def planned(asked: RunConfiguration, describe: Describe = environment.describe) -> Plan:
-    """The plan, before anything was tried. `describe` tells the environment in which it will be carried out.
-
-    Raises
-    ------
-    UserError
-        if something is wrong with what was asked.
-    """
-    task, extractor, dataset, seed = asked.task, asked.extractor, asked.dataset, asked.seed
-    collection = task.collect(asked.images, dataset)
-    hashes = {unit.name: unit.content_hash() for unit in collection.samples}
-    place = None if collection.scene is None else Place(collection.scene, extractor)
-    public = Public(feature_cache.nearest_words, place=place)
-    judged = {
+    task, extractor, dataset, seed = configuration.task, configuration.extractor, configuration.dataset, configuration.seed
+    collection = task.collect(configuration.images, dataset)
+    hashes = {sample.name: sample.content_hash() for sample in collection.samples}
+    index = None if collection.scene is None else SceneIndex(collection.scene, extractor)
+    public = Public(feature_cache.find_nearest_words, scene_index=index)
+    dataset_record = {
         "name": collection.name,
-        "spec": None if dataset is None else spec.written(dataset),
-        "hash": hashing.digest(hashes | dict(collection.beside)),
-        "extractor": spec.configuration(extractor, public),
+        "spec": None if dataset is None else spec.to_json(dataset),
+        "hash": hashing.digest(hashes | dict(collection.extra_inputs)),
+        "extractor": spec.to_json_with_digests(extractor, public),
     }
-    metrics = (*_metrics(), *asked.metrics) if task.judges_attacks else ()
-    settings = {metric.name(): _settings(metric) for metric in metrics}
-    taking_part = [plugin for pair in asked.pairs for plugin in pair if plugin is not None]
-    ran = dict(describe([task, extractor, *taking_part, *metrics]))
-    cells = []
-    for defense, attack in asked.pairs:
-        protected = spec.configuration(defense, public)
+    metrics = (*_default_metrics(), *configuration.metrics) if task.judges_attacks else ()
+    metric_settings = {metric.name(): _settings(metric) for metric in metrics}
+    plugins = [plugin for pair in configuration.pairs for plugin in pair if plugin is not None]
+    environment_record = dict(describe([task, extractor, *plugins, *metrics]))
+    experiments = []
+    for defense, attack in configuration.pairs:
+        defense_record = spec.to_json_with_digests(defense, public)
         reason = task.explain_not_applicable(defense, attack, extractor, public)
-        head = {
+        attack_record = _attack_record(task, defense, attack, extractor, public, reason)
+        experiment_id = records.experiment_id(
+            spec.to_json(task), defense_record, attack_record, dataset_record, seed, metric_settings
+        )
+        metadata = {
             "schema": records.SCHEMA,
             "task": task.name(),
-            "defense": protected,
-            "attack": _attack_configuration(task, defense, attack, extractor, public, reason),
-            "dataset": judged,
+            "defense": defense_record,
+            "attack": attack_record,
+            "dataset": dataset_record,
             "task_settings": _settings(task),
-            "metric_settings": settings,
+            "metric_settings": metric_settings,
             "seed": seed,
-            "sources": {"defense": environment.file_digest(defense), "attack": attack and environment.file_digest(attack)},
+            "sources": {"defense": environment.hash_plugin_file(defense), "attack": attack and environment.hash_plugin_file(attack)},
+            "experiment_id": experiment_id,
+            "run_hash": records.run_hash(experiment_id, environment_record),
+            "environment": environment_record,
         }
-        cell_id = records.experiment_id(spec.written(task), head["defense"], head["attack"], judged, seed, settings)
-        head |= {"cell_id": cell_id, "run_hash": records.run_hash(cell_id, ran), "environment": ran}
-        cells.append(Experiment(defense, attack, defense.privacy(public), head, reason))
-    unique = {cell.metadata["cell_id"]: cell for cell in cells}  # one that was asked for twice is done once
-    return Plan(asked, task, tuple(unique.values()), collection.samples, hashes, extractor, metrics, public, seed)
+        experiments.append(Experiment(defense, attack, defense.privacy(public), metadata, reason))
+    unique = {experiment.metadata["experiment_id"]: experiment for experiment in experiments}
+    return Plan(configuration, task, tuple(unique.values()), collection.samples, hashes, extractor, metrics, public, seed)
 
 
-def execute(plans: Sequence[Plan], out: Path | None = None, engine: Engine = engines.IN_PROCESS) -> Iterator[Record]:
-    """Do what was planned and yield its records: first those that `out` holds already, then others as they are made.
-
-    What several plans have in common is done once. A folder is written by one process at a time, and by this one alone, whatever
-    the engine. `in_order` puts the records into the order of the plans.
-
-    Parameters
-    ----------
-    out : the folder that is written, or resumed; None keeps nothing
-    engine : who does it; by default this process, in the order of the plans
-
-    Raises
-    ------
-    UserError
-        before anything is written, if `out` cannot be written, holds a damaged record, or another process writes to it.
-    OSError
-        if the disk is full; every record yielded so far is kept.
-    """
-    if out is None:
-        yield from (made.record for made in _made(plans, set(), engine))
-        return
-    with records.Log(out / records.FILE) as log:
-        if log.before.notice:
-            logging.getLogger(__name__).warning(log.before.notice)
-        directory.write_plan(out, plans)
-        done = {records.key(record): record for record in log.before.records if record["status"] != "failed"}
-        held = [done[key] for key in dict.fromkeys(key for plan in plans for key in plan.record_keys()) if key in done]
-        yield from held
-        with directory.RunningJobs(out, engine.name) as hand:
-            for made in _made(plans, set(map(records.key, held)), engine, hand.taken):
-                directory.write_result(made, out)
-                log.append(made.record)
-                hand.done(made.record)
-                yield made.record
-
-
-def sort_records(plans: Sequence[Plan], found: Iterable[Record]) -> list[Record]:
-    """Records in the order of the plans, which does not depend on who made them, or when."""
-    places = {key: place for place, key in enumerate(dict.fromkeys(key for plan in plans for key in plan.record_keys()))}
-    return sorted(found, key=lambda record: places[records.key(record)])
-
-
-def _made(
-    plans: Sequence[Plan],
-    done: set[tuple[str, str]],
-    engine: Engine,
-    watched: Callable[[Iterator[Job]], Iterator[Job]] = lambda jobs: jobs,
-) -> Iterator[Result]:
-    """What is not done yet: first what does not apply and needs nobody to do it."""
-    begun = set(done)
-    for cell in (cell for plan in plans for cell in plan.experiments if cell.reason is not None):
-        if (key := (cell.metadata["run_hash"], EVERY_SAMPLE)) not in begun:
-            begun.add(key)
-            yield Result(record=trial.record(cell, None, status="n/a", reason=cell.reason))
-    jobs: dict[tuple[str, str], Job] = {}
-    for job in (
-        Job(plan, cell, unit) for plan in plans for unit in plan.samples for cell in plan.experiments if cell.reason is None
-    ):
-        if job.key not in done:
-            jobs.setdefault(job.key, job)
-    yield from engine(watched(iter(jobs.values())))
-
-
-def _metrics() -> Iterator[Metric]:
-    """All that need not be told anything."""
-    for metric in discovery.everything(discovery.METRIC):
-        if not fields.without_default(metric):
+def _default_metrics() -> Iterator[Metric]:
+    """Yield all metrics that need no setting."""
+    for metric in discovery.load_plugins(discovery.METRIC):
+        if not fields.list_required(metric):
             yield metric()
 
 
 def _settings(plugin: Plugin) -> dict[str, Any]:
-    settings = spec.written(plugin)
+    settings = spec.to_json(plugin)
     del settings["name"]
     return settings | (dict(plugin.parameters) if isinstance(plugin, Metric) else {})
 
 
-def _attack_configuration(
+def _attack_record(
     task: Task, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public, reason: str | None
 ) -> dict[str, Any] | None:
     if attack is None:
         return None
     if reason is not None:
-        return spec.written(attack)
-    return spec.configuration(attack, public, task.resolve(defense, attack, extractor, public))
+        return spec.to_json(attack)
+    return spec.to_json_with_digests(attack, public, task.resolve(defense, attack, extractor, public))

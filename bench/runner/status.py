@@ -1,4 +1,4 @@
-"""How far a run is, told by its folder alone: by the plan, the records, and what its writer has in hand."""
+"""The status of a run, read from its folder: the plan, the records, and the running jobs."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from bench.runner.records import EVERY_SAMPLE, Record
 
 @dataclass(frozen=True, kw_only=True)
 class Count:
-    """Units by how far they are. Each is one of these."""
+    """Numbers of samples by state. Each sample has one of these states."""
 
     done: int = 0
-    running: int = 0  # in the hand of a process that lives
-    failed: int = 0  # and tried again by the next run
+    running: int = 0  # in a process that lives
+    failed: int = 0  # the next run tries them again
     missing: int = 0
 
     def __add__(self, other: Count) -> Count:
@@ -30,35 +30,35 @@ class Count:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ExperimentStatus:
-    """How far a cell is."""
+    """The status of one experiment."""
 
-    metadata: Mapping[str, Any]  # what its records begin with
+    metadata: Mapping[str, Any]  # the part that its records share
     count: Count
-    reason: str | None  # why it does not apply, if it does not
+    reason: str | None  # why it does not apply; None if it does
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Status:
-    """How far the last plan of a folder is."""
+    """The status of the last plan of a folder."""
 
     experiments: tuple[ExperimentStatus, ...]
     other: int  # records of other plans, or of other source, libraries or machines
-    writer: Mapping[str, Any] | None  # who is at work, or was when it ended without notice
-    alive: bool  # whether somebody is
+    writer: Mapping[str, Any] | None  # the process that writes, or that ended without notice
+    alive: bool  # whether a process writes
 
     @property
     def count(self) -> Count:
-        """Of all cells that apply."""
-        return sum((cell.count for cell in self.experiments if cell.reason is None), Count())
+        """The sum over all experiments that apply."""
+        return sum((experiment.count for experiment in self.experiments if experiment.reason is None), Count())
 
     @property
     def inapplicable(self) -> int:
-        """Cells that do not apply."""
-        return sum(cell.reason is not None for cell in self.experiments)
+        """The number of experiments that do not apply."""
+        return sum(experiment.reason is not None for experiment in self.experiments)
 
 
-def status(out: Path) -> Status:
-    """How far that folder's run is.
+def read_status(out: Path) -> Status:
+    """Read the status of a folder.
 
     Raises
     ------
@@ -67,43 +67,45 @@ def status(out: Path) -> Status:
     """
     plans = directory.read_plan(out)
     file = out / records.FILE
-    found = {records.key(record): record for record in (records.read(file).records if file.is_file() else ())}
+    latest = {records.key(record): record for record in (records.read(file).records if file.is_file() else ())}
     alive, writer = records.is_locked(file), directory.read_running(out)
-    in_hand = {(run_hash, unit) for run_hash, unit in (writer or {}).get("jobs", ())} if alive else set()
-    cells = {}
+    running = {(run_hash, sample) for run_hash, sample in (writer or {}).get("jobs", ())} if alive else set()
+    experiments, planned = {}, set()
     for plan in plans:
-        for cell in plan["cells"]:
-            states = Counter(_state((cell["run_hash"], unit), found, in_hand) for unit in plan["units"])
-            count = Count() if cell["reason"] else Count(**states)
-            cells[cell["run_hash"]] = ExperimentStatus(metadata=cell, count=count, reason=cell["reason"])
-    planned = {(cell["run_hash"], unit) for plan in plans for cell in plan["cells"] for unit in (*plan["units"], EVERY_SAMPLE)}
-    return Status(experiments=tuple(cells.values()), other=len(found.keys() - planned), writer=writer, alive=alive)
+        for experiment in plan["experiments"]:
+            run_hash = experiment["run_hash"]
+            states = Counter(_state((run_hash, sample), latest, running) for sample in plan["samples"])
+            count = Count() if experiment["reason"] else Count(**states)
+            experiments[run_hash] = ExperimentStatus(metadata=experiment, count=count, reason=experiment["reason"])
+            planned |= {(run_hash, sample) for sample in (*plan["samples"], EVERY_SAMPLE)}
+    return Status(experiments=tuple(experiments.values()), other=len(latest.keys() - planned), writer=writer, alive=alive)
 
 
-def summarize(found: Status) -> str:
-    """A status in one line."""
-    count = found.count
+def summarize(status: Status) -> str:
+    """Return a status in one line."""
+    count = status.count
     parts = [
         f"{count.done} done, {count.running} running, {count.failed} failed, {count.missing} missing",
-        f"{found.inapplicable} pairs n/a" if found.inapplicable else "",
-        *([f"{found.other} records of other runs"] if found.other else []),
-        _writer(found),
+        f"{status.inapplicable} pairs n/a" if status.inapplicable else "",
+        *([f"{status.other} records of other runs"] if status.other else []),
+        _describe_writer(status),
     ]
     return "; ".join(part for part in parts if part)
 
 
-def _writer(found: Status) -> str:
-    if found.writer is None:
-        return "" if not found.alive else "beginning"
-    since = datetime.fromtimestamp(found.writer["since"])
-    who = f"{found.writer['engine']} of process {found.writer['pid']} on {found.writer['host']}, since {since:%Y-%m-%d %H:%M}"
-    return f"running: {who}" if found.alive else f"ended without notice: {who}; run it again to go on"
+def _describe_writer(status: Status) -> str:
+    if status.writer is None:
+        return "" if not status.alive else "beginning"
+    since = datetime.fromtimestamp(status.writer["since"])
+    process = f"process {status.writer['pid']} on {status.writer['host']}, since {since:%Y-%m-%d %H:%M}"
+    writer = f"{status.writer['engine']} of {process}"
+    return f"running: {writer}" if status.alive else f"ended without notice: {writer}; repeat the command to go on"
 
 
-def _state(key: tuple[str, str], found: Mapping[tuple[str, str], Record], in_hand: set[tuple[str, str]]) -> str:
-    record = found.get(key)
+def _state(key: tuple[str, str], latest: Mapping[tuple[str, str], Record], running: set[tuple[str, str]]) -> str:
+    record = latest.get(key)
     if record is not None and record["status"] != "failed":
         return "done"
-    if key in in_hand:
+    if key in running:
         return "running"
     return "missing" if record is None else "failed"

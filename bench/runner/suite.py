@@ -1,12 +1,12 @@
-"""Suites: what `bench sweep` runs, as plain Python objects.
+"""Suites: the experiments of `bench sweep`, as plain Python objects.
 
 SUITE = Suite(
     summary="Does rounding help?",
     parts=grid(defenses=[Undefended(), Rounding(levels=4)], attacks=[DIA(weights=Asset("W.safetensors"))], seeds=range(3)),
 )
 
-A suite is a module's attribute, here or elsewhere: `bench sweep smoke` means `SUITE` of the file suites/smoke.py, and
-`bench sweep mine/suite.py:SUITE` or `bench sweep package.module:SUITE` one of your own.
+A suite is an attribute of a module. `bench sweep smoke` runs `SUITE` of the file suites/smoke.py. To run your own suite, write
+`bench sweep mine/suite.py:SUITE` or `bench sweep package.module:SUITE`.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from bench.api import Attack, Dataset, Defense, Extractor, Task
+from bench.api import Attack, Dataset, Defense, Extractor
 from bench.core.errors import UserError, unknown_name
 from bench.extractors.sift import Sift
 from bench.images.samples import Images
-from bench.runner import plan
-from bench.runner.plan import RunConfiguration
+from bench.runner.plan import RunConfiguration, cross
+from bench.task_api import Task
 from bench.tasks.reconstruction import Reconstruction
 
 PACKAGE = "suites"
@@ -38,8 +38,8 @@ class Suite:
     summary: str
     parts: tuple[RunConfiguration, ...]
 
-    def on(self, images: Images) -> Suite:
-        """The same with other photographs, where it judges photographs."""
+    def with_images(self, images: Images) -> Suite:
+        """Return the suite with other photographs, in the parts without a dataset."""
         parts = (part if part.dataset else dataclasses.replace(part, images=images) for part in self.parts)
         return dataclasses.replace(self, parts=tuple(parts))
 
@@ -54,9 +54,9 @@ def grid(
     extractors: Sequence[Extractor] = (Sift(),),
     seeds: Sequence[int] = (0,),
 ) -> tuple[RunConfiguration, ...]:
-    """Every defense against every attack, judged by every task, for every dataset, extractor and seed.
+    """Return every defense × attack × task, for every dataset, extractor and seed.
 
-    A task that judges the release itself takes no attack, and `attacks` are not for it.
+    A task that evaluates the release itself ignores `attacks`.
 
     Raises
     ------
@@ -65,7 +65,7 @@ def grid(
     """
     return tuple(
         RunConfiguration(
-            pairs=plan.cross(task, defenses, attacks if task.judges_attacks else ()),
+            pairs=cross(task, defenses, attacks if task.judges_attacks else ()),
             images=images,
             task=task,
             extractor=extractor,
@@ -76,52 +76,52 @@ def grid(
     )
 
 
-def names() -> list[str]:
-    """The suites of this distribution."""
+def list_suites() -> list[str]:
+    """Return the names of the suites of this distribution."""
     package = importlib.import_module(PACKAGE)
     return sorted(info.name.replace("_", "-") for info in pkgutil.iter_modules(package.__path__))
 
 
 def find(text: str) -> Suite:
-    """The suite that is meant: by name, as `module:NAME`, or as `path/to/file.py:NAME`.
+    """Return the suite given by its name, as `module:NAME`, or as `path/to/file.py:NAME`.
 
     Raises
     ------
     UserError
-        if there is none, or it cannot be imported.
+        if there is none, or its module cannot be imported.
     """
-    place, colon, attribute = text.rpartition(":")
+    module_path, colon, attribute = text.rpartition(":")
     if not colon:
-        if text not in names():
-            raise unknown_name("suite", text, names())
-        place, attribute = f"{PACKAGE}.{text.replace('-', '_')}", "SUITE"
+        if text not in list_suites():
+            raise unknown_name("suite", text, list_suites())
+        module_path, attribute = f"{PACKAGE}.{text.replace('-', '_')}", "SUITE"
     try:
-        module = importlib.import_module(_module(place))
+        module = importlib.import_module(_import_path(module_path))
     except UserError:
         raise
-    except Exception as error:  # whatever a stranger's module raises while it is imported
-        raise UserError(f"suite {text!r}: {place} cannot be imported: {type(error).__name__}: {error}") from error
-    found = getattr(module, attribute, None)
-    if not isinstance(found, Suite):
+    except Exception as error:  # a user's module can raise any error
+        raise UserError(f"suite {text!r}: {module_path} cannot be imported: {type(error).__name__}: {error}") from error
+    suite = getattr(module, attribute, None)
+    if not isinstance(suite, Suite):
         raise UserError(
-            f"suite {text!r}: {place} has no Suite called {attribute!r} (bench/runner/suite.py shows how one is written)"
+            f"suite {text!r}: {module_path} has no Suite called {attribute!r} (bench/runner/suite.py shows an example)"
         )
-    return found
+    return suite
 
 
-def folder(text: str) -> Path:
-    """Where its results lie, unless it is said where: `runs/sweep-` and its name, or those of its file or module and its own."""
-    place, colon, attribute = text.rpartition(":")
-    stem = Path(place).stem if place.endswith(".py") else place.rpartition(".")[2]
+def choose_folder(text: str) -> Path:
+    """Return the default results folder: `runs/sweep-` and the suite's name, or the names of its module and attribute."""
+    module_path, colon, attribute = text.rpartition(":")
+    stem = Path(module_path).stem if module_path.endswith(".py") else module_path.rpartition(".")[2]
     return Path("runs") / f"sweep-{f'{stem}-{attribute}' if colon else text}"
 
 
-def _module(place: str) -> str:
-    """The module's name. A file's folder is searched first from now on, in worker processes too."""
-    if not place.endswith(".py"):
-        return place
-    file = Path(place).resolve()
+def _import_path(module_path: str) -> str:
+    """Return the module's import name. Puts a file's folder first on the import path, in worker processes too."""
+    if not module_path.endswith(".py"):
+        return module_path
+    file = Path(module_path).resolve()
     if not file.is_file():
-        raise UserError(f"{place}: no such file")
+        raise UserError(f"{module_path}: no such file")
     sys.path.insert(0, str(file.parent))
     return file.stem

@@ -1,7 +1,8 @@
-"""Carries out a plan, one unit of one cell at a time: read, extract, protect, judge, record.
+"""Executes one sample of one experiment at a time: read, extract, protect, evaluate, record.
 
 The randomness of a release is a function of (seed, photograph's content, defense, extractor) alone, never of the attack, the
-order, the process, or what was done before.
+order, the process, or earlier samples. The strings "release", "device", "population", "attack", "rehearsal" and the keys of
+`provenance` enter that randomness and the keys of caches: they are data and keep their wording.
 """
 
 from __future__ import annotations
@@ -13,197 +14,215 @@ import time
 import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from PIL import Image
 
-from bench.api import Attack, Defense, Outcome, ProtectedImage, Trial, execute_in_process
+from bench.api import Defense, Extractor
 from bench.cache import feature_cache
 from bench.core import hashing
-from bench.core.errors import PluginError, SampleError, UserError, blame
-from bench.core.randomness import randomness
+from bench.core.errors import PluginError, SampleError, UserError, wrap_plugin_errors
+from bench.core.randomness import derive_generator
 from bench.images import samples
 from bench.images.photographs import Source
 from bench.images.samples import ImageSource, Sample
 from bench.mechanisms import composition
 from bench.registry import spec
-from bench.runner.other_releases import OtherReleases
-from bench.runner.records import EVERY_SAMPLE, Record
-from bench.types import Bytes, Features, Floats, Release
-
-if TYPE_CHECKING:
-    from bench.runner.plan import Experiment, Plan
+from bench.runner.other_releases import ReleasePool
+from bench.runner.plan import Experiment, Plan
+from bench.runner.records import EVERY_SAMPLE, Record, seal
+from bench.task_api import ExtractedImage, Outcome, ProtectedImage, Trial, execute_in_process
+from bench.types import Bytes, Features, Release
 
 
 @dataclass(frozen=True, kw_only=True)
 class Result:
-    """What came of one unit of one cell. Whoever keeps the run writes it down; nobody else writes anything."""
+    """The record of one sample of one experiment, and the files that belong to it. Only `execute` writes them."""
 
     record: Record
-    picture: bytes | None = None  # the reconstruction, if one was made, as PNG
-    trace: str | None = None  # of a plugin that broke
+    reconstruction: bytes | None = None  # PNG
+    photograph: bytes | None = None  # PNG, with a sample's first reconstruction
+    trace: str | None = None  # traceback of a plugin that raised
 
 
-@dataclass(frozen=True, eq=False)
-class _Observed:
-    """What the owner of an image has."""
-
-    image: ImageSource
-    features: Features
-    pixels: Callable[[], Bytes]
-    notes: tuple[str, ...]
-
-
-class Trials:
-    """The trials of a plan. What those of one unit share is made once, if they come in a row."""
+class TrialRunner:
+    """Executes the trials of a plan. Trials of one sample share its features and releases if they follow each other."""
 
     def __init__(self, plan: Plan) -> None:
         self.plan = plan
-        self._order = hashing.digest(list(plan.hashes))  # in which the releases of others come
-        self._observed = functools.lru_cache(maxsize=1)(self._observe)
-        self._shots = functools.lru_cache(maxsize=1)(self._release)
-        self._population = functools.lru_cache(maxsize=None)(self._others)
+        self._order = hashing.digest(list(plan.hashes))  # in which other releases come
+        self._protect_sample = functools.lru_cache(maxsize=1)(self._protect_images)
+        self._pool = functools.lru_cache(maxsize=None)(self._build_pool)
+        self._pictured: str | None = None  # the sample whose photograph was last returned
 
-    def execute(self, cell: Experiment, unit: Sample) -> Result:
-        """Read and extract the unit, protect it, let the attack at it, and record how that ended."""
+    def execute(self, experiment: Experiment, sample: Sample) -> Result:
+        """Read, extract, protect and evaluate the sample, and return the result, also of a failure."""
         try:
-            return self._judged(cell, unit)
+            return self._evaluate(experiment, sample)
         except (SampleError, UserError) as error:
             trace = "".join(traceback.format_exception(error)) if isinstance(error, PluginError) else None
-            return Result(record=record(cell, unit, status="failed", reason=str(error)), trace=trace)
+            return Result(record=build_record(experiment, sample, status="failed", reason=str(error)), trace=trace)
 
-    def forget(self) -> None:
-        """Let go of the last unit's releases, which may be gigabytes, and would wait for the collector of cycles."""
-        self._observed.cache_clear()
-        self._shots.cache_clear()
+    def clear(self) -> None:
+        """Drop the last sample's features and releases, which may be gigabytes."""
+        _extract_sample.cache_clear()
+        self._protect_sample.cache_clear()
 
-    def rehearse(self) -> None:
-        """Protect one keypoint of the first good image by each defense.
+    def build_trial(self, experiment: Experiment, sample: Sample) -> Trial:
+        """Extract and protect a sample.
 
         Raises
         ------
-        UserError
-            if a defense cannot do what was asked of it.
+        SampleError
+            if it cannot be read, has no keypoint, or a plugin raises.
         """
-        plan = self.plan
-        for unit in plan.samples:
-            try:
-                features = self._seen(unit.images[0]).features
-            except SampleError:
-                continue
-            for cell in {cell.defense: cell for cell in plan.experiments}.values():
-                with contextlib.suppress(SampleError):  # a broken plugin makes failed records, later
-                    self._protect(cell, features.take(np.arange(1)), "rehearsal")
-            return
+        plan, attack = self.plan, experiment.attack
+        images, content = self._protect_sample(experiment.defense, sample), plan.hashes[sample.name]
+        made_with = experiment.metadata["defense"], experiment.metadata["dataset"]["extractor"]
+        # Without the task's settings: an attack whose descriptors another inverter reconstructs draws the same numbers.
+        configuration = attack and spec.to_json_with_digests(
+            attack, plan.public, attack.assets(experiment.defense, plan.extractor, plan.public)
+        )
+        provenance = {
+            "seed": plan.seed,
+            "dataset": [experiment.metadata["dataset"]["hash"], self._order],
+            "unit": [sample.name, content],
+            "made with": made_with,
+        }
+        return Trial(
+            sample=sample,
+            images=images,
+            defense=experiment.defense,
+            attack=attack,
+            extractor=plan.extractor,
+            public=plan.public,
+            metrics=plan.metrics,
+            rng=derive_generator("attack", plan.seed, content, *made_with, configuration),
+            others=self._pool(experiment.defense).without(sample.name),
+            repeats=tuple(
+                self.protect(experiment, images[0].secret, content, number)
+                for number in range(1, 1 + (0 if attack is None else attack.repeats()))
+            ),
+            execute=plan.execute,
+            provenance=provenance if plan.execute is execute_in_process else None,  # another process must execute the attack itself
+        )
 
-    def _observe(self, unit: Sample) -> tuple[_Observed, ...]:
-        return tuple(self._seen(image) for image in unit.images)
-
-    def _seen(self, image: ImageSource) -> _Observed:
-        extractor = self.plan.extractor
-        if isinstance(image, Source):
-            with blame("the reader of photographs"):
-                pixels, notes = samples.read_pixels(image)
-            with blame(f"plugin {extractor.name()}"):
-                features = extractor.extract(pixels, image.path)
-            seen = _Observed(image, features, lambda: pixels, notes)
-        else:
-            with blame(f"plugin {extractor.name()}"):
-                features = feature_cache.features(extractor, image)
-            seen = _Observed(image, features, image.read, ())
-        if len(features) == 0:
-            raise SampleError("no keypoint was found")
-        return seen
-
-    def _release(self, defense: Defense, unit: Sample) -> tuple[ProtectedImage, ...]:
-        """The release of each image of a unit: a function of the image's content alone."""
-        cell, shots = self._cell(defense), []
-        for seen in self._observed(unit):
-            content = self.plan.hashes[unit.name] if len(unit.images) == 1 else seen.image.content_hash()
-            release = self._protect(cell, seen.features, content)
-            foreground = functools.partial(samples.read_foreground, seen.image)
-            shots.append(ProtectedImage(pixels=seen.pixels, secret=seen.features, release=release, foreground=foreground))
-        return tuple(shots)
-
-    def _protect(self, cell: Experiment, features: Features, content: str, *repetition: int) -> Release:
-        plan, defense = self.plan, cell.defense
-        made_with = cell.metadata["defense"], cell.metadata["dataset"]["extractor"]
+    def protect(self, experiment: Experiment, features: Features, content: str, *repetition: int | str) -> Release:
+        """Return the release of features whose photograph has that content hash; the first release has no `repetition`."""
+        plan, defense = self.plan, experiment.defense
+        made_with = experiment.metadata["defense"], experiment.metadata["dataset"]["extractor"]
         if defense.is_memoized():  # all photographs, and all their repetitions, come from one device
-            rng = randomness("device", plan.seed, *made_with)
+            rng = derive_generator("device", plan.seed, *made_with)
         else:
-            rng = randomness("release", plan.seed, content, *made_with, *repetition)
-        with blame(f"plugin {defense.name()}"):
+            rng = derive_generator("release", plan.seed, content, *made_with, *repetition)
+        with wrap_plugin_errors(f"plugin {defense.name()}"):
             release = defense.protect(features, plan.public, rng)
             if not isinstance(release, defense.releases):
                 raise TypeError(f"protect returned {type(release).__name__}, expected {defense.releases.__name__}")
         return release
 
-    def _others(self, defense: Defense) -> OtherReleases:
-        """Releases of the dataset's photographs by that defense."""
-        plan, head = self.plan, self._cell(defense).metadata
-        sources = [image for unit in plan.samples for image in unit.images if isinstance(image, Source)]
-        drawn = functools.partial(randomness, "population", plan.seed, head["defense"], head["dataset"]["extractor"])
-        return OtherReleases(sources, plan.extractor, defense, plan.public, drawn)
+    def _protect_images(self, defense: Defense, sample: Sample) -> tuple[ProtectedImage, ...]:
+        """Return each image of a sample with its release, which is a function of the image's content alone."""
+        experiment, images = self._find_experiment(defense), []
+        for source, extracted in zip(sample.images, extract_sample(self.plan, sample), strict=True):
+            content = self.plan.hashes[sample.name] if len(sample.images) == 1 else source.content_hash()
+            release = self.protect(experiment, extracted.secret, content)
+            images.append(ProtectedImage(**vars(extracted), release=release))
+        return tuple(images)
 
-    def _cell(self, defense: Defense) -> Experiment:
-        """One that has that defense."""
-        return next(cell for cell in self.plan.experiments if cell.defense == defense)
-
-    def trial(self, cell: Experiment, unit: Sample) -> Trial:
-        """A unit of a cell, extracted and protected, before it is judged.
-
-        Raises
-        ------
-        UnitError
-            if it cannot be read, has no keypoint, or a plugin breaks.
-        """
-        plan, head, attack = self.plan, cell.metadata, cell.attack
-        shots, content = self._shots(cell.defense, unit), plan.hashes[unit.name]
-        made_with = head["defense"], head["dataset"]["extractor"]
-        # Without what the task does with what was recovered: an attack that is painted by another inverter stays what it was.
-        attacked = attack and spec.configuration(attack, plan.public, attack.assets(cell.defense, plan.extractor, plan.public))
-        made_from = {
-            "seed": plan.seed,
-            "dataset": [head["dataset"]["hash"], self._order],
-            "unit": [unit.name, content],
-            "made with": made_with,
-        }
-        return Trial(
-            sample=unit,
-            images=shots,
-            defense=cell.defense,
-            attack=attack,
-            extractor=plan.extractor,
-            public=plan.public,
-            metrics=plan.metrics,
-            rng=randomness("attack", plan.seed, content, *made_with, attacked),
-            others=self._population(cell.defense).without(unit.name),
-            repeats=tuple(self._protect(cell, shots[0].secret, content, number) for number in _repetitions(attack)),
-            execute=plan.execute,
-            provenance=made_from if plan.execute is execute_in_process else None,  # whoever wants it done elsewhere wants it done
+    def _build_pool(self, defense: Defense) -> ReleasePool:
+        """Return releases of the dataset's photographs by that defense."""
+        plan, metadata = self.plan, self._find_experiment(defense).metadata
+        sources = [image for sample in plan.samples for image in sample.images if isinstance(image, Source)]
+        derive = functools.partial(
+            derive_generator, "population", plan.seed, metadata["defense"], metadata["dataset"]["extractor"]
         )
+        return ReleasePool(sources, plan.extractor, defense, plan.public, derive)
 
-    def _judged(self, cell: Experiment, unit: Sample) -> Result:
-        tried = self.trial(cell, unit)
+    def _find_experiment(self, defense: Defense) -> Experiment:
+        """Return an experiment with that defense."""
+        return next(experiment for experiment in self.plan.experiments if experiment.defense == defense)
+
+    def _evaluate(self, experiment: Experiment, sample: Sample) -> Result:
+        trial = self.build_trial(experiment, sample)
         started = time.perf_counter()
-        with blame(f"task {self.plan.task.name()}"):
-            outcome = self.plan.task.evaluate(tried)
+        with wrap_plugin_errors(f"task {self.plan.task.name()}"):
+            outcome = self.plan.task.evaluate(trial)
         seconds = time.perf_counter() - started + outcome.saved_seconds
-        keypoints = max(len(shot.secret) for shot in tried.images)
-        notes = [note for seen in self._observed(unit) for note in seen.notes]
-        found = record(cell, unit, status="ok", outcome=outcome, keypoints=keypoints, notes=notes, seconds=seconds)
-        return Result(record=found, picture=None if outcome.image is None else _png(outcome.image))
+        keypoints = max(len(image.secret) for image in trial.images)
+        notes = [note for image in trial.images for note in image.notes]
+        record = build_record(
+            experiment, sample, status="ok", outcome=outcome, keypoints=keypoints, notes=notes, seconds=seconds
+        )
+        if outcome.image is None:
+            return Result(record=record)
+        photograph = None if self._pictured == sample.name else _encode_png(trial.pixels())
+        self._pictured = sample.name
+        image = np.rint(outcome.image * 255.0).astype(np.uint8)
+        return Result(record=record, reconstruction=_encode_png(image), photograph=photograph)
 
 
-def _repetitions(attack: Attack | None) -> range:
-    """The numbers of the further releases that an attack sees. The first release has none."""
-    return range(1, 1 + (0 if attack is None else attack.repeats()))
+def dry_run(plan: Plan) -> None:
+    """Protect one keypoint of the first readable image by each defense, so that a mistake shows before anything is written.
+
+    Raises
+    ------
+    UserError
+        if no pair applies, or a defense refuses its configuration.
+    """
+    if all(experiment.reason for experiment in plan.experiments):
+        raise UserError("nothing to run: " + "; ".join(sorted({str(experiment.reason) for experiment in plan.experiments})))
+    runner = TrialRunner(plan)
+    for sample in plan.samples:
+        try:
+            features = extract_sample(plan, sample)[0].secret
+        except SampleError:
+            continue
+        for experiment in {experiment.defense: experiment for experiment in plan.experiments}.values():
+            with contextlib.suppress(SampleError):  # a plugin that raises gives failed records later
+                runner.protect(experiment, features.take(np.arange(1)), "rehearsal")
+        return
 
 
-def record(
-    cell: Experiment,
-    unit: Sample | None,
+def extract_sample(plan: Plan, sample: Sample) -> tuple[ExtractedImage, ...]:
+    """Return the images of a sample, read and extracted once, before they are protected.
+
+    Raises
+    ------
+    SampleError
+        if one cannot be read, or has no keypoint.
+    """
+    return _extract_sample(plan.extractor, sample, plan.hashes[sample.name])
+
+
+@functools.lru_cache(maxsize=1)
+def _extract_sample(extractor: Extractor, sample: Sample, content: str) -> tuple[ExtractedImage, ...]:
+    """`content` is the sample's hash: a file that has changed is read again."""
+    return tuple(_extract_image(extractor, image) for image in sample.images)
+
+
+def _extract_image(extractor: Extractor, image: ImageSource) -> ExtractedImage:
+    read: Callable[[], Bytes]
+    if isinstance(image, Source):
+        with wrap_plugin_errors("the reader of photographs"):
+            pixels, notes = samples.read_pixels(image)
+        with wrap_plugin_errors(f"plugin {extractor.name()}"):
+            features = extractor.extract(pixels, image.path)
+        read = functools.partial(_same, pixels)
+    else:
+        with wrap_plugin_errors(f"plugin {extractor.name()}"):
+            features = feature_cache.extract(extractor, image)
+        read, notes = image.read, ()
+    if len(features) == 0:
+        raise SampleError("no keypoint was found")
+    foreground = functools.partial(samples.read_foreground, image)
+    return ExtractedImage(pixels=read, secret=features, foreground=foreground, notes=notes)
+
+
+def build_record(
+    experiment: Experiment,
+    sample: Sample | None,
     *,
     status: str,
     reason: str | None = None,
@@ -212,51 +231,55 @@ def record(
     notes: Sequence[str] = (),
     seconds: float | None = None,
 ) -> Record:
-    """The record of a unit, or of all of them for None. `keypoints` are those of its image that has most."""
-    found = {"estimates": dict(outcome.estimates)} if outcome is not None and outcome.estimates else {}
-    return (
-        cell.metadata
-        | found
+    """Return the record of a sample, or of all samples for None. `keypoints` are those of its image that has most."""
+    estimates = {"estimates": dict(outcome.estimates)} if outcome is not None and outcome.estimates else {}
+    return seal(
+        experiment.metadata
+        | estimates
         | {
-            "unit": EVERY_SAMPLE if unit is None else unit.name,
-            "condition": None if unit is None else unit.condition,
+            "sample": EVERY_SAMPLE if sample is None else sample.name,
+            "condition": None if sample is None else sample.condition,
             "status": status,
             "reason": reason,
             "metrics": {} if outcome is None else {**outcome.metrics, "keypoints": keypoints},
-            "privacy": privacy(cell, keypoints),
+            "privacy": build_privacy(experiment, keypoints),
             "seconds": seconds,
             "notes": [*notes, *(outcome.notes if outcome else ())],
         }
     )
 
 
-def privacy(cell: Experiment, keypoints: int | None) -> dict[str, Any]:
-    """What the defense promises of what is released of one image, and what nothing covers."""
-    epsilon, remembers = cell.privacy.epsilon, cell.defense.is_memoized()
-    # A device that remembers answers once, however often it is asked.
-    releases = 1 if remembers or cell.attack is None else 1 + cell.attack.repeats()
-    spent: dict[str, float | str | None] = {"epsilon_image": None, "epsilon_image_optimal": None}
+def build_privacy(experiment: Experiment, keypoints: int | None) -> dict[str, Any]:
+    """Return the guarantee for the release of one image, and what no guarantee covers."""
+    epsilon, memoized = experiment.privacy.epsilon, experiment.defense.is_memoized()
+    # A memoized defense answers once, however often it is asked.
+    releases = 1 if memoized or experiment.attack is None else 1 + experiment.attack.repeats()
+    image: dict[str, float | str | None] = {"epsilon_image": None, "epsilon_image_optimal": None}
     if epsilon is not None and keypoints is not None:
         answers = keypoints * releases
-        spent["epsilon_image"] = spec.finite(composition.basic(epsilon, answers))
-        spent["epsilon_image_optimal"] = spec.finite(composition.optimal(epsilon, answers))
-    by_distance = cell.privacy.per_distance
+        image["epsilon_image"] = spec.encode_infinity(composition.compose_basic(epsilon, answers))
+        image["epsilon_image_optimal"] = spec.encode_infinity(composition.compose_optimal(epsilon, answers))
+    per_distance = experiment.privacy.per_distance
     return {
-        "guarantee": cell.privacy.guarantee,
-        "epsilon_descriptor": spec.finite(epsilon),
-        **({} if by_distance is None else {"epsilon_per_distance": float(by_distance)}),
+        "guarantee": experiment.privacy.guarantee,
+        "epsilon_descriptor": spec.encode_infinity(epsilon),
+        **({} if per_distance is None else {"epsilon_per_distance": float(per_distance)}),
         "keypoints": keypoints,
         "releases": releases,  # of the photograph
-        **spent,
+        **image,
         "delta": composition.DELTA,  # of the optimal one
-        "uncovered": [*composition.UNCOVERED, *([composition.LINKS] if remembers else [])],
-        "log10_true": cell.privacy.log10_true,
+        "uncovered": [*composition.UNCOVERED, *([composition.LINKS] if memoized else [])],
+        "log10_true": experiment.privacy.log10_true,
         "seeded": True,
         "private": False,  # a seeded release is for measuring
     }
 
 
-def _png(image: Floats) -> bytes:
-    written = io.BytesIO()
-    Image.fromarray(np.rint(image * 255.0).astype(np.uint8)).save(written, "png")
-    return written.getvalue()
+def _same(pixels: Bytes) -> Bytes:
+    return pixels
+
+
+def _encode_png(image: Bytes) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, "png")
+    return buffer.getvalue()

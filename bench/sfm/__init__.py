@@ -1,1 +1,1 @@
-"""Structure from motion of releases: which matches are kept, and what COLMAP makes of them."""
+"""Structure from motion of releases: selection and verification of matches, and COLMAP's mapping."""

@@ -1,13 +1,13 @@
-"""Matches whose neighbours move alike: how true ones are found among many that are due to chance.
+"""Selection of true matches among many accidental ones: true matches have neighbours with similar displacements.
 
-Where sets of words are released, most matches of two images are accidents: with N keypoints of m words each, of |K| words, some
+Between two releases of word sets most matches are accidental: with N keypoints of m words each, of |K| words, about
 
     |K| (λ e^-λ)²,    λ = N m / |K|,
 
-words are unique in both images by chance. They scatter; true matches lie in a field of displacements that changes little from
-one place to the next. So the support of a match is counted, as the matches nearby that are displaced like it (grid-based motion
-statistics: Bian et al., CVPR 2017), and the half that has least of it is dropped, again and again: chance fades as their number
-does, and the support that true matches give each other stays.
+words are unique in both images by chance. These scatter; the displacements of true matches vary smoothly over the image. The
+support of a match is the number of nearby matches with a similar displacement (grid-based motion statistics: Bian et al.,
+CVPR 2017). The half with least support is dropped repeatedly: support by chance falls with the number of matches, and the support
+that true matches give each other stays.
 """
 
 from __future__ import annotations
@@ -20,58 +20,58 @@ from bench.types import Indices
 
 Doubles = NDArray[np.float64]
 
-NEAR = 0.1  # half the side of the neighbourhood, as a share of the image's longer side
-ALIKE = 0.025  # of the displacement, likewise
-TELLING = 0.05  # chance of what counts as more support than chance gives
-CLEAN = 0.8  # share of matches with such support at which no more are dropped
-MANY = 2000  # matches, of which most are accidents in any case: as many as an image has keypoints
+NEAR = 0.1  # half the side of the neighbourhood, as a fraction of the image's longer side
+SIMILAR = 0.025  # the same for displacements
+SIGNIFICANCE = 0.05  # level at which support counts as more than chance
+CLEAN_FRACTION = 0.8  # of the matches with significant support; then no more are dropped
+MAX_CLEAN = 2000  # as many matches as an image has keypoints; of more, most are accidental
 
 
-def support(first: Doubles, second: Doubles, near: float, alike: float) -> Indices:
-    """For each match the number of other matches near it that are displaced alike. (M, 2), (M, 2) pixels -> (M,)
+def count_support(first: Doubles, second: Doubles, near: float, similar: float) -> Indices:
+    """Count for each match the other matches nearby with a similar displacement. (M, 2), (M, 2) pixels -> (M,)
 
     Parameters
     ----------
-    near, alike : how far apart two positions in the first image, and two displacements, may be along each axis, in pixels
+    near, similar : largest difference along each axis of positions in the first image, and of displacements, in pixels
     """
-    places = _places(first, second, near, alike)
-    return np.asarray(cKDTree(places).query_ball_point(places, 1.0, p=np.inf, return_length=True), np.int64) - 1
+    points = _embed(first, second, near, similar)
+    return np.asarray(cKDTree(points).query_ball_point(points, 1.0, p=np.inf, return_length=True), np.int64) - 1
 
 
-def consistent(first: Doubles, second: Doubles, longer: float, fewest: int, rng: np.random.Generator) -> Indices:
-    """Rows of the matches that support each other, ascending. (M, 2), (M, 2) pixels -> (M',)
+def select_consistent(first: Doubles, second: Doubles, longer: float, minimum: int, rng: np.random.Generator) -> Indices:
+    """Select the matches that support each other. (M, 2), (M, 2) pixels -> (M',) their rows, ascending
 
-    Stops when four in five of those left have more support than nineteen in twenty of as many matches between the same
-    positions that are shuffled, or when `fewest` are left.
+    Stops when 80% of the remaining matches have more support than 95% of the same matches shuffled, or when `minimum` remain.
 
     Parameters
     ----------
     longer : of the image's sides, in pixels
     """
     left = np.arange(len(first))
-    near, alike = NEAR * longer, ALIKE * longer
-    while len(left) > fewest:
+    near, similar = NEAR * longer, SIMILAR * longer
+    while len(left) > minimum:
         a, b = first[left], second[left]
-        found = support(a, b, near, alike)
-        if len(left) <= MANY and _clean(found, support(a, rng.permutation(b), near, alike)):
+        support = count_support(a, b, near, similar)
+        if len(left) <= MAX_CLEAN and _is_clean(support, count_support(a, rng.permutation(b), near, similar)):
             break
-        kept = np.argsort(-found, kind="stable")[: max(fewest, len(left) // 2)]
-        left = left[np.sort(kept)]
+        best = np.argsort(-support, kind="stable")[: max(minimum, len(left) // 2)]
+        left = left[np.sort(best)]
     return left
 
 
-def _clean(found: Indices, chance: Indices) -> bool:
-    return bool((found > np.quantile(chance, 1 - TELLING)).mean() >= CLEAN)
+def _is_clean(support: Indices, chance: Indices) -> bool:
+    """Whether enough matches have more support than shuffled ones."""
+    return bool((support > np.quantile(chance, 1 - SIGNIFICANCE)).mean() >= CLEAN_FRACTION)
 
 
-def supported(first: Doubles, second: Doubles, trusted: Indices, longer: float) -> Indices:
-    """Rows of the matches near a trusted one, other than themselves, that are displaced like it, ascending. -> (M',)"""
-    places = _places(first, second, NEAR * longer, ALIKE * longer)
-    counts = np.asarray(cKDTree(places[trusted]).query_ball_point(places, 1.0, p=np.inf, return_length=True))
+def find_supported(first: Doubles, second: Doubles, trusted: Indices, longer: float) -> Indices:
+    """Find the matches near another, trusted match with a similar displacement. -> (M',) their rows, ascending"""
+    points = _embed(first, second, NEAR * longer, SIMILAR * longer)
+    counts = np.asarray(cKDTree(points[trusted]).query_ball_point(points, 1.0, p=np.inf, return_length=True))
     counts[trusted] -= 1
     return np.flatnonzero(counts > 0)
 
 
-def _places(first: Doubles, second: Doubles, near: float, alike: float) -> Doubles:
-    """Points that are at most 1 apart along each axis where matches are near and displaced alike. -> (M, 4)"""
-    return np.concatenate([first / near, (second - first) / alike], axis=1)
+def _embed(first: Doubles, second: Doubles, near: float, similar: float) -> Doubles:
+    """Map matches to points that differ by at most 1 along each axis if near with similar displacements. -> (M, 4)"""
+    return np.concatenate([first / near, (second - first) / similar], axis=1)

@@ -1,8 +1,8 @@
-"""Which pairs of images see the same thing, and by which matches: an essential matrix by RANSAC, among the consistent matches.
+"""Verification of image pairs: an essential matrix by RANSAC, among the consistent matches.
 
-Where nearly all matches are accidents, some agree with whatever RANSAC finds. How many is measured, not assumed: the same is
-done for some of the pairs with their matches shuffled, and a geometry counts if a larger share agrees with it than with any of
-those. Then every match is looked at again: it is kept if it agrees with the geometry and moves like one that was found with it.
+Where nearly all matches are accidental, some agree with any result of RANSAC. Their number is measured: the same is done for some
+pairs with shuffled matches. A geometry counts if a larger fraction of matches agrees with it than with any of those. Finally all
+matches are tested again: one counts if it agrees with the geometry and has a displacement similar to an inlier's nearby.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ import numpy as np
 import pycolmap
 
 from bench.core.progress import Progress
-from bench.sfm.consistency import Doubles, consistent, supported
+from bench.sfm.consistency import Doubles, find_supported, select_consistent
 from bench.types import Floats, Indices
 
-ERROR = 3.0  # pixels off the epipolar line, in COLMAP's Sampson error
+MAX_ERROR = 3.0  # pixels off the epipolar line, in COLMAP's Sampson error
 TRIALS = 10_000  # of RANSAC
 CONFIDENCE = 0.9999
-FEWEST = 100  # matches that are left, if there are as many
-LEAST = 15  # matches that a geometry rests on, COLMAP's own bound
+MIN_CONSISTENT = 100  # consistent matches that are selected, if there are as many
+MIN_MATCHES = 15  # inliers of a geometry, COLMAP's own bound
 SAMPLE = 5  # matches that RANSAC fits: they agree in any case
-SHUFFLED = 32  # pairs whose matches are shuffled, about
+SHUFFLED_PAIRS = 32  # approximate number of pairs with shuffled matches
 
 Pair = tuple[int, int]
 Matches = Mapping[Pair, Indices]  # images a < b -> (M, 2) keypoints of a, of b
@@ -32,52 +32,51 @@ Matches = Mapping[Pair, Indices]  # images a < b -> (M, 2) keypoints of a, of b
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Geometry:
-    """Two images and what they have in common."""
+    """The relative pose of two images, and their matches."""
 
-    matches: Indices  # (M, 2) that agree
+    matches: Indices  # (M, 2) that agree with the pose
     essential: Doubles  # (3, 3)
     second_from_first: pycolmap.Rigid3d  # the translation has no length
-    rate: float  # share of the consistent matches that agreed, those aside that RANSAC fitted
+    rate: float  # fraction of the consistent matches that agreed, without the sample that RANSAC fitted
 
 
-def verified(
+def verify_pairs(
     camera: pycolmap.Camera, keypoints: Sequence[Floats], matches: Matches, seed: int, threads: int = 2
 ) -> dict[Pair, Geometry]:
-    """The pairs whose geometry is more than chance, in the order of `matches`.
+    """Return the pairs whose geometry is more than chance, in the order of `matches`.
 
     Parameters
     ----------
     camera : of all images
     keypoints : (N, 2) of each image
-    threads : at once; the result does not depend on it
+    threads : number of threads; the result does not depend on it
     """
-    enough = [pair for pair, found in matches.items() if len(found) >= LEAST]
-    sample = enough[:: max(1, len(enough) // SHUFFLED)]
+    pairs = [pair for pair, rows in matches.items() if len(rows) >= MIN_MATCHES]
+    sample = pairs[:: max(1, len(pairs) // SHUFFLED_PAIRS)]
 
-    def judged(job: tuple[Pair, bool]) -> Geometry | None:
+    def estimate(job: tuple[Pair, bool]) -> Geometry | None:
         (a, b), shuffle = job
         rng = np.random.default_rng([seed, a, b, int(shuffle)])
-        found = matches[a, b]
+        rows = matches[a, b]
         if shuffle:
-            found = np.stack([found[:, 0], rng.permutation(found[:, 1])], axis=1)
-        return geometry(camera, keypoints[a], keypoints[b], found, rng)
+            rows = np.stack([rows[:, 0], rng.permutation(rows[:, 1])], axis=1)
+        return estimate_geometry(camera, keypoints[a], keypoints[b], rows, rng)
 
-    jobs = [(pair, True) for pair in sample] + [(pair, False) for pair in enough]
+    jobs = [(pair, True) for pair in sample] + [(pair, False) for pair in pairs]
     with ThreadPoolExecutor(threads) as pool, Progress("pairs of images", len(jobs)) as progress:
-        found = []
-        for each in pool.map(judged, jobs):
-            found.append(each)
+        geometries = []
+        for geometry in pool.map(estimate, jobs):
+            geometries.append(geometry)
             progress.advance()
-    chance = max((each.rate for each in found[: len(sample)] if each is not None), default=0.0)
-    return {
-        pair: each for pair, each in zip(enough, found[len(sample) :], strict=True) if each is not None and each.rate > chance
-    }
+    chance = max((each.rate for each in geometries[: len(sample)] if each is not None), default=0.0)
+    estimates = zip(pairs, geometries[len(sample) :], strict=True)
+    return {pair: each for pair, each in estimates if each is not None and each.rate > chance}
 
 
-def geometry(
+def estimate_geometry(
     camera: pycolmap.Camera, first: Floats, second: Floats, matches: Indices, rng: np.random.Generator
 ) -> Geometry | None:
-    """The geometry that most of the consistent matches agree with; None if they are too few.
+    """Estimate the geometry that most of the consistent matches agree with; None if they are too few.
 
     Parameters
     ----------
@@ -86,31 +85,31 @@ def geometry(
     """
     a, b = first[matches[:, 0]].astype(np.float64), second[matches[:, 1]].astype(np.float64)  # (M, 2) pixels
     longer = float(max(camera.width, camera.height))
-    kept = consistent(a, b, longer, FEWEST, rng)
-    # RANSAC stops before its trials where it takes a share of inliers for granted; it shall not.
+    consistent = select_consistent(a, b, longer, MIN_CONSISTENT, rng)
+    # A large min_inlier_ratio would stop RANSAC before TRIALS.
     options = pycolmap.RANSACOptions(
-        max_error=ERROR,
+        max_error=MAX_ERROR,
         max_num_trials=TRIALS,
         min_inlier_ratio=0.01,
         confidence=CONFIDENCE,
         random_seed=int(rng.integers(2**31)),
     )
-    found = pycolmap.estimate_essential_matrix(a[kept], b[kept], camera, camera, options)
-    if found is None or found["num_inliers"] < LEAST:
+    report = pycolmap.estimate_essential_matrix(a[consistent], b[consistent], camera, camera, options)
+    if report is None or report["num_inliers"] < MIN_MATCHES:
         return None
-    agreeing = kept[found["inlier_mask"]]
-    near = supported(a, b, agreeing, longer)
-    near = near[_errors(camera, a[near], b[near], found["E"]) <= ERROR]
+    inliers = consistent[report["inlier_mask"]]
+    near = find_supported(a, b, inliers, longer)
+    near = near[_compute_errors(camera, a[near], b[near], report["E"]) <= MAX_ERROR]
     return Geometry(
-        matches=matches[np.union1d(agreeing, near)],
-        essential=np.asarray(found["E"]),
-        second_from_first=found["cam2_from_cam1"],
-        rate=(len(agreeing) - SAMPLE) / (len(kept) - SAMPLE),
+        matches=matches[np.union1d(inliers, near)],
+        essential=np.asarray(report["E"]),
+        second_from_first=report["cam2_from_cam1"],
+        rate=(len(inliers) - SAMPLE) / (len(consistent) - SAMPLE),
     )
 
 
-def _errors(camera: pycolmap.Camera, first: Doubles, second: Doubles, essential: Doubles) -> Doubles:
-    """Sampson errors in pixels. (M, 2), (M, 2) pixels -> (M,)"""
+def _compute_errors(camera: pycolmap.Camera, first: Doubles, second: Doubles, essential: Doubles) -> Doubles:
+    """Compute Sampson errors in pixels. (M, 2), (M, 2) pixels -> (M,)"""
     if len(first) == 0:
         return np.empty(0)
     a, b = (np.asarray(camera.cam_from_img(points)) for points in (first, second))

@@ -18,14 +18,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.api import Attack, Dataset, Defense, Extractor, Lifting, Outcome, Task, Trial, explain_no_words
+from bench.api import Attack, Dataset, Defense, Extractor, Lifting, explain_no_words
 from bench.codebook.public import Public
 from bench.core.errors import SampleError, UserError
-from bench.geometry.intersections import MEETS, Doubles
+from bench.geometry.intersections import INTERSECTION_DISTANCE, Doubles
 from bench.geometry.nearest_words import unit_rows
-from bench.geometry.shared_sub_database import company, nearest_that_meet
+from bench.geometry.shared_sub_database import compute_intersection_distances, find_shared_sub_database
 from bench.images.samples import Collection, Images, collect_only_photographs
 from bench.registry import fields
+from bench.task_api import Outcome, Task, Trial
 from bench.types import Release, Subspaces
 
 
@@ -61,14 +62,16 @@ class Collisions(Task):
         if not isinstance(defense, Lifting):
             raise SampleError("collisions needs subspaces through words of a database")
         lifted = defense.lift(trial.secret, trial.public, trial.rng)
-        words = trial.public.dictionary(fields.asset_fields(defense)["database"]).words  # (K, D)
+        words = trial.public.dictionary(fields.list_assets(defense)["database"]).words  # (K, D)
         points = np.concatenate(
             [trial.secret.descriptors[:, None], unit_rows(words[lifted.words])], axis=1
         )  # (N, 1 + a, D) d, a_i
-        shared = company(lifted.release, _subspaces(trial.others(self.others)), defense.adversarial, self.coverage)
-        nearest = nearest_that_meet(points.astype(np.float64), shared)  # (N, 1 + a)
-        clear = no_collision(nearest, self.tolerance)
-        met = nearest[:, 1:] < MEETS  # (N, a)
+        shared = find_shared_sub_database(
+            lifted.release, _check_subspaces(trial.others(self.others)), defense.adversarial, self.coverage
+        )
+        nearest = compute_intersection_distances(points.astype(np.float64), shared)  # (N, 1 + a)
+        clear = is_collision_free(nearest, self.tolerance)
+        met = nearest[:, 1:] < INTERSECTION_DISTANCE  # (N, a)
         covered = met.all(axis=1)
         return Outcome(
             metrics={
@@ -76,19 +79,19 @@ class Collisions(Task):
                 "no_collision_covered": float(clear[covered].mean()) if covered.any() else None,
                 "coverage": float(met.mean()),
                 "covered": float(covered.mean()),
-                "releases_asked": float(shared.asked),
-                "releases_kept": float(shared.kept),
+                "releases_asked": float(shared.searched),
+                "releases_kept": float(shared.sharing),
             }
         )
 
 
-def no_collision(nearest: Doubles, tolerance: float) -> NDArray[np.bool_]:
+def is_collision_free(nearest: Doubles, tolerance: float) -> NDArray[np.bool_]:
     """Whether d, the first point, is further from what meets D than the others by more than `tolerance`. (N, 1 + a) -> (N,)"""
     own, adversarial = nearest[:, 0], nearest[:, 1:].max(axis=1)
     return np.isfinite(own) & (own > adversarial + tolerance)
 
 
-def _subspaces(releases: Iterator[Release]) -> Iterator[Subspaces]:
+def _check_subspaces(releases: Iterator[Release]) -> Iterator[Subspaces]:
     for release in releases:
         if not isinstance(release, Subspaces):
             raise SampleError(f"collisions needs subspaces, got {type(release).__name__}")

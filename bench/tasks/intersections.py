@@ -20,13 +20,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.api import Attack, Dataset, Defense, Extractor, Lifting, Outcome, Task, Trial, explain_no_words
+from bench.api import Attack, Dataset, Defense, Extractor, Lifting, explain_no_words
 from bench.codebook.public import Public
 from bench.core.errors import SampleError, UserError
 from bench.geometry.nearest_words import unit_rows
-from bench.geometry.subspaces import nearest_to_subspaces
+from bench.geometry.subspaces import find_nearest_to_subspaces
 from bench.images.samples import Collection, Images, collect_only_photographs
 from bench.registry import fields
+from bench.task_api import Outcome, Task, Trial
 from bench.types import Features, Floats
 
 COUNTS = (50, 20, 10, 5)  # N
@@ -64,23 +65,31 @@ class Intersections(Task):
         defense = trial.defense
         if not isinstance(defense, Lifting):
             raise SampleError("intersections needs subspaces through words of a database")
-        words = trial.public.dictionary(fields.asset_fields(defense)["database"]).words  # (K, D)
+        words = trial.public.dictionary(fields.list_assets(defense)["database"]).words  # (K, D)
         count = self.subspaces or len(trial.secret)
         alone, among = [], []
-        for secret in rounds(trial.secret, count, trial.rng):
+        for secret in draw_rounds(trial.secret, count, trial.rng):
             lifted = defense.lift(secret, trial.public, trial.rng)
-            near, _ = nearest_to_subspaces(lifted.release, words, max(COUNTS) + defense.adversarial)  # (n, N + a)
+            near, _ = find_nearest_to_subspaces(lifted.release, words, max(COUNTS) + defense.adversarial)  # (n, N + a)
             for rows in np.array_split(np.arange(len(near)), -(-len(near) // BATCH)):
                 points = np.concatenate(
                     [secret.descriptors[rows, None], unit_rows(words[lifted.words[rows]])], axis=1
                 )  # (b, 1 + a, D)
-                match = matches(unit_rows(words[near[rows]]), points, self.ratio)  # (b, N + a)
+                match = pass_ratio_test(unit_rows(words[near[rows]]), points, self.ratio)  # (b, N + a)
                 among.append(match)
-                alone.append(without(match, (near[rows][:, :, None] == lifted.words[rows][:, None]).any(axis=2), max(COUNTS)))
-        return Outcome(metrics={**_shares("success", alone), **_shares("with_adversarial", among), "subspaces": float(count)})
+                alone.append(
+                    drop_left_out(match, (near[rows][:, :, None] == lifted.words[rows][:, None]).any(axis=2), max(COUNTS))
+                )
+        return Outcome(
+            metrics={
+                **_compute_fractions("success", alone),
+                **_compute_fractions("with_adversarial", among),
+                "subspaces": float(count),
+            }
+        )
 
 
-def rounds(secret: Features, count: int, rng: np.random.Generator) -> Iterator[Features]:
+def draw_rounds(secret: Features, count: int, rng: np.random.Generator) -> Iterator[Features]:
     """The descriptors in random order, again and again, until there are `count` of them."""
     while count > 0:
         chosen = np.sort(rng.permutation(len(secret))[:count])
@@ -88,20 +97,20 @@ def rounds(secret: Features, count: int, rng: np.random.Generator) -> Iterator[F
         count -= len(chosen)
 
 
-def matches(words: Floats, points: Floats, ratio: float) -> NDArray[np.bool_]:
+def pass_ratio_test(words: Floats, points: Floats, ratio: float) -> NDArray[np.bool_]:
     """Whether a word's nearest point is less than `ratio` times as far as its second nearest. (n, N, D), (n, p, D) -> (n, N)"""
     away = np.linalg.norm(words[:, :, None].astype(np.float64) - points[:, None], axis=3)  # (n, N, p)
     nearest, second = np.moveaxis(np.partition(away, 1, axis=2)[:, :, :2], 2, 0)
     return nearest < ratio * second
 
 
-def without(match: NDArray[np.bool_], left_out: NDArray[np.bool_], count: int) -> NDArray[np.bool_]:
+def drop_left_out(match: NDArray[np.bool_], left_out: NDArray[np.bool_], count: int) -> NDArray[np.bool_]:
     """Of each row the first `count` that are not left out. (n, N + a), (n, N + a) -> (n, count)"""
     order = np.argsort(left_out, axis=1, kind="stable")[:, :count]
     return np.take_along_axis(match, order, axis=1)
 
 
-def _shares(name: str, match: list[NDArray[np.bool_]]) -> dict[str, float]:
+def _compute_fractions(name: str, match: list[NDArray[np.bool_]]) -> dict[str, float]:
     """The share of successes among the first N columns, for each N."""
     rows = np.concatenate(match)
     return {f"{name}_top{count}": float(rows[:, :count].mean()) for count in COUNTS}

@@ -13,16 +13,17 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from bench.api import Attack, Dataset, Defense, Extractor, Outcome, Task, Trial
+from bench.api import Attack, Dataset, Defense, Extractor
 from bench.codebook.public import Public
 from bench.core.errors import SampleError, UserError
 from bench.datasets.gallery import Gallery
-from bench.formats import lists
+from bench.formats import lists, pairs
 from bench.images import samples
 from bench.images.samples import Collection, Images
 from bench.images.scene import SceneImage
-from bench.localization import map_matching, pairs, pose
+from bench.localization import map_matching, pose
 from bench.localization.server import Server
+from bench.task_api import Outcome, Task, Trial
 from bench.types import Features, Indices
 
 # Within which a pose counts: units of length and degrees (Sattler et al., CVPR 2018).
@@ -58,8 +59,10 @@ class Localization(Task):
         return samples.collect_queries(dataset or Gallery())
 
     def explain_not_applicable(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> str | None:
-        name = self._matcher(defense)
-        return f"nothing matches {defense.releases.__name__}" if name is None else map_matching.inapplicable(name, defense)
+        name = self._select_matcher(defense)
+        return (
+            f"nothing matches {defense.releases.__name__}" if name is None else map_matching.explain_not_applicable(name, defense)
+        )
 
     def resolve(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> Mapping[str, Any]:
         return {}
@@ -67,11 +70,11 @@ class Localization(Task):
     def evaluate(self, trial: Trial) -> Outcome:
         query: SceneImage = trial.sample.subject
         server = Server(public=trial.public, camera=query.camera)
-        _check(server, trial.secret, query.name)
-        matcher = self._matcher(trial.defense)
+        _check_intrinsics(server, trial.secret, query.name)
+        matcher = self._select_matcher(trial.defense)
         if matcher is None:
             raise SampleError(f"nothing matches {type(trial.release).__name__}")
-        references, seed = self._retrieved(server, trial, query), int(trial.rng.integers(2**31))
+        references, seed = self._retrieve(server, trial, query), int(trial.rng.integers(2**31))
         found = server.localize(trial.release, trial.defense, references, matcher, self.trials, seed)
         told = {
             "matches": float(len(found.correspondences)),
@@ -80,35 +83,35 @@ class Localization(Task):
         }
         there = None if found.estimate is None else found.estimate.cam_from_world
         estimates = {
-            "pose": None if there is None else [*lists.quaternion(there).tolist(), *there.translation.tolist()],
-            "retrieved": [server.place.map.names[reference] for reference in references],
+            "pose": None if there is None else [*lists.to_wxyz(there).tolist(), *there.translation.tolist()],
+            "retrieved": [server.scene_index.map.names[reference] for reference in references],
         }
         if query.cam_from_world is None:
             return Outcome(metrics=told, estimates=estimates, notes=("its pose is withheld",))
-        errors = None if there is None else pose.errors(there, query.cam_from_world)
-        return Outcome(metrics={**within(errors), **told}, estimates=estimates)
+        errors = None if there is None else pose.compute_errors(there, query.cam_from_world)
+        return Outcome(metrics={**score_pose(errors), **told}, estimates=estimates)
 
-    def _matcher(self, defense: Defense) -> str | None:
-        return map_matching.default(defense) if self.matcher == "auto" else self.matcher
+    def _select_matcher(self, defense: Defense) -> str | None:
+        return map_matching.select_matcher(defense) if self.matcher == "auto" else self.matcher
 
-    def _retrieved(self, server: Server, trial: Trial, query: SceneImage) -> Indices:
+    def _retrieve(self, server: Server, trial: Trial, query: SceneImage) -> Indices:
         if self.pairs is not None:
-            return listed(self.pairs, query.name, server.place.map.names)[: self.retrieved]
+            return look_up_pairs(self.pairs, query.name, server.scene_index.map.names)[: self.retrieved]
         if self.retrieval == "raw":
-            return server.seen_by(trial.secret, self.retrieved)
-        return server.seen_in(trial.release, trial.defense, self.retrieved)
+            return server.retrieve_by_query(trial.secret, self.retrieved)
+        return server.retrieve_by_release(trial.release, trial.defense, self.retrieved)
 
 
-def _check(server: Server, secret: Features, query: str) -> None:
+def _check_intrinsics(server: Server, secret: Features, query: str) -> None:
     """Raise UnitError if the intrinsics are wrong; found out by raw features, so that all defenses have the same queries."""
-    known = server.place.misfits
+    known = server.scene_index.focal_mismatches
     if query not in known:
-        known[query] = server.misfit(secret)
+        known[query] = server.estimate_focal_mismatch(secret)
     if (ratio := known[query]) is not None:
         raise SampleError(f"{query}: its intrinsics do not fit; its raw features ask for {ratio:.2f} times the focal length")
 
 
-def within(errors: tuple[float, float] | None) -> dict[str, float | None]:
+def score_pose(errors: tuple[float, float] | None) -> dict[str, float | None]:
     """Which thresholds a pose meets, and its errors; None is a query that was not localized."""
     translation, rotation = (None, None) if errors is None else errors
     met = {
@@ -118,7 +121,7 @@ def within(errors: tuple[float, float] | None) -> dict[str, float | None]:
     return {**met, "translation_error": translation, "rotation_error": rotation}
 
 
-def listed(path: Path, query: str, names: tuple[str, ...]) -> Indices:
+def look_up_pairs(path: Path, query: str, names: tuple[str, ...]) -> Indices:
     """The references that a file of pairs lists for a query.
 
     Raises

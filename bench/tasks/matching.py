@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from bench.api import Attack, Dataset, Defense, Extractor, Outcome, Task, Trial
+from bench.api import Attack, Dataset, Defense, Extractor
 from bench.codebook.public import Public
 from bench.core import hashing
 from bench.core.errors import SampleError, UserError
@@ -30,12 +30,13 @@ from bench.images.samples import Collection, Images, Sample
 from bench.localization import two_view_matching
 from bench.rendering import homographies
 from bench.rendering.homographies import Pair
+from bench.task_api import Outcome, Task, Trial
 from bench.types import Descriptors, Floats, Indices, Subspaces, WordSets
 
 Doubles = NDArray[np.float64]
 
-RIGHT = 3.0  # pixels
-WITHIN = range(1, 11)  # pixels
+MAX_ERROR = 3.0  # pixels
+ACCURACY_LIMITS = range(1, 11)  # pixels
 SEED = 0  # of the pairs that are made
 
 
@@ -62,10 +63,10 @@ class Matching(Task):
         if dataset is not None:
             raise UserError("matching judges pairs of images and takes no dataset; give --images with a folder of HPatches")
         if images is None:
-            return _collected("pairs", homographies.made(SEED, self.each))
+            return _build_collection("pairs", homographies.create_pairs(SEED, self.each))
         if not isinstance(images, (str, Path)):
             raise UserError("matching judges pairs of images; give a folder of HPatches")
-        return _collected(Path(images).resolve().name, homographies.hpatches(Path(images)))
+        return _build_collection(Path(images).resolve().name, homographies.load_hpatches(Path(images)))
 
     def explain_not_applicable(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> str | None:
         if issubclass(defense.releases, (Descriptors, Subspaces, WordSets)):
@@ -80,12 +81,16 @@ class Matching(Task):
         if not isinstance(pair, Pair):
             raise SampleError("matching needs a pair of images with a homography")
         query, reference = trial.images
-        second = reference.release if self.both else two_view_matching.unprotected(reference.secret, trial.defense, trial.public)
-        found = two_view_matching.matches(query.release, second, self.ratio)
-        return Outcome(metrics=accuracy(query.release.keypoints, second.keypoints, pair.homography, found))
+        second = (
+            reference.release
+            if self.both
+            else two_view_matching.prepare_unprotected(reference.secret, trial.defense, trial.public)
+        )
+        found = two_view_matching.match_releases(query.release, second, self.ratio)
+        return Outcome(metrics=compute_accuracy(query.release.keypoints, second.keypoints, pair.homography, found))
 
 
-def accuracy(first: Floats, second: Floats, homography: Doubles, matches: Indices) -> dict[str, float | None]:
+def compute_accuracy(first: Floats, second: Floats, homography: Doubles, matches: Indices) -> dict[str, float | None]:
     """What the top of this file defines; recall is None if no keypoint has a true correspondence.
 
     Parameters
@@ -94,23 +99,23 @@ def accuracy(first: Floats, second: Floats, homography: Doubles, matches: Indice
     homography : (3, 3) from the first image to the second
     matches : (M, 2)
     """
-    expected = transferred(first, homography)  # (N, 2)
+    expected = transfer(first, homography)  # (N, 2)
     errors = np.linalg.norm(expected[matches[:, 0]] - second[matches[:, 1]], axis=1)  # (M,)
     possible = np.zeros(len(first), dtype=bool)
     seen = np.isfinite(expected).all(axis=1)
-    possible[seen] = cKDTree(second).query(expected[seen])[0] < RIGHT
+    possible[seen] = cKDTree(second).query(expected[seen])[0] < MAX_ERROR
     right = np.zeros(len(first), dtype=bool)
-    right[matches[errors < RIGHT, 0]] = True
+    right[matches[errors < MAX_ERROR, 0]] = True
     return {
-        "precision": _share(errors < RIGHT),
+        "precision": _compute_fraction(errors < MAX_ERROR),
         "recall": float(right[possible].mean()) if possible.any() else None,
-        **{f"mma_{t:02}px": _share(errors < t) for t in WITHIN},
+        **{f"mma_{t:02}px": _compute_fraction(errors < t) for t in ACCURACY_LIMITS},
         "matches": float(len(matches)),
         "correspondences": float(possible.sum()),
     }
 
 
-def transferred(points: Floats, homography: Doubles) -> Doubles:
+def transfer(points: Floats, homography: Doubles) -> Doubles:
     """Where points of the first image are in the second; infinite on and beyond the horizon. (N, 2) -> (N, 2)"""
     lifted = np.concatenate([points, np.ones((len(points), 1))], axis=1, dtype=np.float64) @ homography.T  # (N, 3)
     depth = np.where(lifted[:, 2:] > 0, lifted[:, 2:], 0.0)
@@ -118,16 +123,16 @@ def transferred(points: Floats, homography: Doubles) -> Doubles:
         return np.where(depth > 0, lifted[:, :2] / depth, np.inf)
 
 
-def _share(flags: NDArray[np.bool_]) -> float:
+def _compute_fraction(flags: NDArray[np.bool_]) -> float:
     return float(flags.mean()) if len(flags) else 0.0
 
 
-def _collected(name: str, pairs: Sequence[Pair]) -> Collection:
+def _build_collection(name: str, pairs: Sequence[Pair]) -> Collection:
     homographies_of = {pair.name: pair.homography.tolist() for pair in pairs}
     return Collection(
         name=name,
         samples=tuple(Sample(name=pair.name, images=(pair.first, pair.second), subject=pair) for pair in pairs),
-        beside={"homographies": hashing.digest(homographies_of)},
+        extra_inputs={"homographies": hashing.digest(homographies_of)},
     )
 
 

@@ -10,17 +10,27 @@ from typing import Any
 
 import numpy as np
 
-from bench.api import Attack, Dataset, Defense, Extractor, ImageAttack, LocalMetric, Metric, Outcome, Selection, Task, Trial, View
+from bench.api import Attack, Dataset, Defense, Extractor, ImageAttack, LocalMetric, Metric, Selection, View
 from bench.cache import attack_cache
 from bench.codebook.public import Public
-from bench.core.errors import SampleError, UserError, blame
+from bench.core.errors import SampleError, UserError, wrap_plugin_errors
 from bench.images import samples
 from bench.images.samples import Collection, Images
 from bench.images.scene import Mask
 from bench.registry import discovery, fields, spec
-from bench.types import Descriptors, Floats, Knowledge
+from bench.task_api import Outcome, Task, Trial
+from bench.threat_model import (
+    DefenseDatabase,
+    Knowledge,
+    OtherReleases,
+    PublicAssets,
+    PublicDatabase,
+    RepeatedReleases,
+    ServerMap,
+)
+from bench.types import Descriptors, Floats, Points
 
-RELEASES = {Knowledge.OTHER_RELEASES, Knowledge.REPEATED_RELEASES}  # which every defense can make
+RELEASES = {OtherReleases, RepeatedReleases}  # which every defense can make
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,16 +54,17 @@ class Reconstruction(Task):
     def explain_not_applicable(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> str | None:
         if attack is None:
             return "reconstruction needs an attack"
-        missing = attack.needs - offered(attack, defense, public).keys() - RELEASES
+        served = {ServerMap} if public.scene_index is not None else set()
+        missing = attack.needs - offer_knowledge(attack, defense, public).keys() - RELEASES - served
         if missing:
-            wanted = " and ".join(sorted(need.value for need in missing))
+            wanted = " and ".join(sorted(need.description for need in missing))
             return f"{attack.name()} needs {wanted}; there is none for {defense.name()}"
         return attack.explain_not_applicable(defense, extractor, public)
 
     def resolve(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> Mapping[str, Any]:
         if attack is None:
             return {}
-        for what, load in offered(attack, defense, public).items():
+        for what, load in offer_knowledge(attack, defense, public).items():
             if what in attack.needs:
                 load()
         digests = dict(attack.assets(defense, extractor, public))
@@ -62,22 +73,26 @@ class Reconstruction(Task):
         inverter, undefended, reason = self._inverter(extractor, public)
         if reason is not None:
             return digests | {"inversion": None}
-        return digests | {"inversion": spec.configuration(inverter, public, inverter.assets(undefended, extractor, public))}
+        return digests | {
+            "inversion": spec.to_json_with_digests(inverter, public, inverter.assets(undefended, extractor, public))
+        }
 
     def evaluate(self, trial: Trial) -> Outcome:
         attack = trial.attack
         if attack is None:
             raise SampleError("reconstruction needs an attack")
         if isinstance(attack, ImageAttack):
-            return compared(trial, None, reconstructed(attack, view(trial), trial))
-        found = attack_cache.recover_cached(attack, trial, view(trial))
+            return compared(trial, None, reconstructed(attack, build_view(trial), trial))
+        found = attack_cache.recover_cached(attack, trial, build_view(trial))
         inverter, undefended, reason = self._inverter(trial.extractor, trial.public)
         if reason is not None:
             outcome = compared(trial, found.selection, None, (*found.notes, f"no image: {reason}"))
             return dataclasses.replace(outcome, saved_seconds=found.saved_seconds)
         keypoints = trial.release.keypoints[found.selection.rows]
-        release = Descriptors(keypoints=keypoints, size=trial.release.size, descriptors=found.selection.descriptors)
-        seen = view(dataclasses.replace(trial.released(release), attack=inverter, defense=undefended))
+        release = Descriptors(
+            positions=Points(keypoints=keypoints), size=trial.release.size, descriptors=found.selection.descriptors
+        )
+        seen = build_view(dataclasses.replace(trial.with_release(release), attack=inverter, defense=undefended))
         outcome = compared(trial, found.selection, reconstructed(inverter, seen, trial), found.notes)
         return dataclasses.replace(outcome, saved_seconds=found.saved_seconds)
 
@@ -86,51 +101,49 @@ class Reconstruction(Task):
         inverter = spec.read(self.inverter, discovery.ATTACK)
         if not isinstance(inverter, ImageAttack):
             raise UserError(f"reconstruction: inverter must reconstruct images, and {inverter.name()} does not")
-        undefended = discovery.lookup(discovery.DEFENSE, "none")()
+        undefended = discovery.load_plugin(discovery.DEFENSE, "none")()
         return inverter, undefended, inverter.explain_not_applicable(undefended, extractor, public)
 
 
-def offered(attack: Attack, defense: Defense, public: Public) -> dict[Knowledge, Callable[[], Any]]:
-    """What there is to know beside releases made by that defense."""
-    databases = fields.asset_fields(defense)
-    own = fields.asset_fields(attack).get("database", "shipped-public")
-    offers: dict[Knowledge, Callable[[], Any]] = {
-        Knowledge.PUBLIC_DATABASE: lambda: public.dictionary(own),
-        Knowledge.TRAINING_IMAGES: lambda: public,
+def offer_knowledge(attack: Attack, defense: Defense, public: Public) -> dict[type[Knowledge], Callable[[], Knowledge]]:
+    """Return loaders of what there is to know beside the releases of that defense and the server's map."""
+    databases = fields.list_assets(defense)
+    own = fields.list_assets(attack).get("database", "shipped-public")
+    offers: dict[type[Knowledge], Callable[[], Knowledge]] = {
+        PublicDatabase: lambda: PublicDatabase(words=public.dictionary(own).words),
+        PublicAssets: lambda: PublicAssets(assets=public),
     }
     if "database" in databases:
-        offers[Knowledge.DATABASE] = lambda: public.dictionary(databases["database"])
-    if public.place is not None:
-        offers[Knowledge.MAP] = lambda: public.place
+        offers[DefenseDatabase] = lambda: DefenseDatabase(words=public.dictionary(databases["database"]).words)
     return offers
 
 
-def view(trial: Trial) -> View:
-    """All that the attack gets: copies of what was released, and of the rest only what it declared to need."""
+def build_view(trial: Trial) -> View:
+    """Return all that the attack gets: copies of what was released, and of the rest only what it declared to need."""
     attack = trial.attack
     assert attack is not None
-    offers = offered(attack, trial.defense, trial.public) | {
-        Knowledge.OTHER_RELEASES: lambda: lambda count: map(copy.deepcopy, trial.others(count)),
-        Knowledge.REPEATED_RELEASES: lambda: copy.deepcopy(list(trial.repeats)),
-        Knowledge.MAP: lambda: _served(trial),
+    offers = offer_knowledge(attack, trial.defense, trial.public) | {
+        OtherReleases: lambda: OtherReleases(draw=lambda count: map(copy.deepcopy, trial.others(count))),
+        RepeatedReleases: lambda: RepeatedReleases(releases=copy.deepcopy(trial.repeats)),
+        ServerMap: lambda: _server_map(trial),
     }
     return View(
         release=copy.deepcopy(trial.release),  # whatever the attack does to it, the next attack sees what was released
         defense=trial.defense,
         extractor=trial.extractor,
-        knowledge={what: load for what, load in offers.items() if what in attack.needs},
+        knowledge={kind: load for kind, load in offers.items() if kind in attack.needs},
     )
 
 
-def _served(trial: Trial) -> Any:
-    from bench.localization.server import Server  # it brings COLMAP with it
+def _server_map(trial: Trial) -> ServerMap:
+    from bench.localization.server import Server  # it imports COLMAP
 
-    return Server(public=trial.public, camera=trial.sample.subject.camera)
+    return ServerMap(server=Server(public=trial.public, camera=trial.sample.subject.camera))
 
 
 def reconstructed(attack: ImageAttack, seen: View, trial: Trial) -> Floats:
     """The attacker's image. -> (H, W, 3)"""
-    with blame(f"plugin {attack.name()}"):
+    with wrap_plugin_errors(f"plugin {attack.name()}"):
         image: Floats = trial.execute(attack.reconstruct, seen, trial.rng)
         width, height = seen.release.size
         attack_cache.check_array(image, (height, width, 3))
@@ -163,7 +176,7 @@ def parts(metrics: Sequence[Metric], truth: Floats, image: Floats, mask: Mask) -
     values: dict[str, float | None] = {}
     for metric in metrics:
         if isinstance(metric, LocalMetric):
-            with blame(f"plugin {metric.name()}"):
+            with wrap_plugin_errors(f"plugin {metric.name()}"):
                 each = metric.local(truth, image)  # (H, W)
             for part, inside in (("foreground", mask), ("background", ~mask)):
                 values[f"{metric.name()}_{part}"] = float(each[inside].mean()) if inside.any() else None
@@ -171,7 +184,7 @@ def parts(metrics: Sequence[Metric], truth: Floats, image: Floats, mask: Mask) -
 
 
 def _measured(metric: Metric, truth: Floats, estimate: Floats) -> float | None:
-    with blame(f"plugin {metric.name()}"):
+    with wrap_plugin_errors(f"plugin {metric.name()}"):
         value = metric(truth, estimate)
         if value is not None and not np.isfinite(value):
             raise ValueError(f"returned {value}; a metric returns None where its value is not finite")

@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pycolmap
 
-from bench.api import Attack, Dataset, Defense, Extractor, Outcome, Task, Trial
+from bench.api import Attack, Dataset, Defense, Extractor
 from bench.codebook.public import Public
 from bench.core.errors import SampleError, UserError
 from bench.datasets.walk import Walk
@@ -24,6 +24,7 @@ from bench.images.scene import SceneImage
 from bench.localization import two_view_matching
 from bench.sfm import agreement, incremental_mapping, picture, verification
 from bench.sfm.incremental_mapping import Mapper, Model
+from bench.task_api import Outcome, Task, Trial
 from bench.types import Descriptors, Release, Subspaces, WordSets
 
 
@@ -42,8 +43,8 @@ class Structure(Task):
     mapper: Mapper = "global"
 
     def __post_init__(self) -> None:
-        if self.images < incremental_mapping.SMALLEST:
-            raise UserError(f"structure: images must be at least {incremental_mapping.SMALLEST}, got {self.images}")
+        if self.images < incremental_mapping.MIN_IMAGES:
+            raise UserError(f"structure: images must be at least {incremental_mapping.MIN_IMAGES}, got {self.images}")
         if not 0 < self.ratio <= 1:
             raise UserError(f"structure: ratio must be above 0 and at most 1, got {self.ratio}")
         if self.mapper not in ("incremental", "global"):
@@ -56,13 +57,15 @@ class Structure(Task):
             )
         scene = (dataset or Walk()).scene()
         chosen = scene.queries[: self.images]
-        if len(chosen) < incremental_mapping.SMALLEST:
+        if len(chosen) < incremental_mapping.MIN_IMAGES:
             raise UserError(f"{scene.name}: {len(chosen)} queries, of which nothing can be rebuilt")
         for image in chosen:
-            if _intrinsics(image.camera) != _intrinsics(chosen[0].camera):
+            if _intrinsics_key(image.camera) != _intrinsics_key(chosen[0].camera):
                 raise UserError(f"{scene.name}: {chosen[0].name} and {image.name} are of different cameras; structure takes one")
         unit = Sample(name=scene.name, images=tuple(image.pixels for image in chosen), subject=chosen)
-        return Collection(name=scene.name, samples=(unit,), scene=scene, beside={"scene": samples.fingerprint(chosen)})
+        return Collection(
+            name=scene.name, samples=(unit,), scene=scene, extra_inputs={"scene": samples.hash_scene_images(chosen)}
+        )
 
     def explain_not_applicable(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> str | None:
         if issubclass(defense.releases, (Descriptors, Subspaces, WordSets)):
@@ -77,9 +80,9 @@ class Structure(Task):
         releases = [shot.release for shot in trial.images]
         keypoints = [release.keypoints for release in releases]
         camera, seed = images[0].camera, int(trial.rng.integers(2**31))
-        found = {(a, b): self._matches(releases[a], releases[b]) for a, b in itertools.combinations(range(len(releases)), 2)}
-        geometries = verification.verified(camera, keypoints, found, seed)
-        model = incremental_mapping.mapped(camera, keypoints, geometries, self.mapper, seed)
+        found = {(a, b): self._match(releases[a], releases[b]) for a, b in itertools.combinations(range(len(releases)), 2)}
+        geometries = verification.verify_pairs(camera, keypoints, found, seed)
+        model = incremental_mapping.build_model(camera, keypoints, geometries, self.mapper, seed)
         told = {
             "images": float(len(images)),
             "tried_matches": float(np.mean([len(pairs) for pairs in found.values()])),
@@ -87,20 +90,20 @@ class Structure(Task):
             "verified_matches": float(sum(len(geometry.matches) for geometry in geometries.values())),
         }
         return Outcome(
-            metrics={**measured(model, [image.cam_from_world for image in images]), **told},
-            image=None if model is None else picture.from_above(model),
+            metrics={**compute_metrics(model, [image.cam_from_world for image in images]), **told},
+            image=None if model is None else picture.draw_from_above(model),
         )
 
-    def _matches(self, first: Release, second: Release) -> np.ndarray:
+    def _match(self, first: Release, second: Release) -> np.ndarray:
         try:
             # Subspaces are as far from their second nearest as from their nearest, nearly: the ratio would tell nothing.
             ratio = 1.0 if isinstance(first, Subspaces) else self.ratio
-            return two_view_matching.matches(first, second, ratio, unique=True)
+            return two_view_matching.match_releases(first, second, ratio, unique=True)
         except TypeError as error:
             raise SampleError(str(error)) from None
 
 
-def measured(model: Model | None, truth: Sequence[pycolmap.Rigid3d | None]) -> dict[str, float | None]:
+def compute_metrics(model: Model | None, truth: Sequence[pycolmap.Rigid3d | None]) -> dict[str, float | None]:
     """The paper's four measures, and how many images are where they were taken; None where poses are withheld.
 
     Parameters
@@ -122,11 +125,11 @@ def measured(model: Model | None, truth: Sequence[pycolmap.Rigid3d | None]) -> d
         "points": float(len(model.points)),
         "track_length": model.track_length,
         "reprojection_error": model.reprojection_error,
-        "right_poses": float(agreement.right(model, known)) if len(known) == len(truth) else None,
+        "right_poses": float(agreement.count_correct_poses(model, known)) if len(known) == len(truth) else None,
     }
 
 
-def _intrinsics(camera: pycolmap.Camera) -> tuple[Any, ...]:
+def _intrinsics_key(camera: pycolmap.Camera) -> tuple[Any, ...]:
     return camera.model, camera.width, camera.height, tuple(camera.params)
 
 

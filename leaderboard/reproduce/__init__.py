@@ -1,5 +1,5 @@
-"""The paper's tables and figures, rebuilt beside the paper's own numbers: `bench reproduce`."""
+"""The paper's tables and figures, beside the paper's own numbers: `bench reproduce`."""
 
-from leaderboard.reproduce.command import Done, materials, reproduce
+from leaderboard.reproduce.command import Reproduction, list_materials, reproduce
 
-__all__ = ["Done", "materials", "reproduce"]
+__all__ = ["Reproduction", "list_materials", "reproduce"]

@@ -1,4 +1,4 @@
-"""`bench reproduce NAME`: one table, or the figures."""
+"""`bench reproduce NAME`: reproduces one table, or the figures."""
 
 from __future__ import annotations
 
@@ -10,17 +10,18 @@ from typing import TYPE_CHECKING
 
 from rich.text import Text
 
-from bench.api import Asset, Dataset, Extractor
+from bench.api import Dataset, Extractor
 from bench.core import threads
 from bench.core.errors import UserError, unknown_name
 from bench.extractors.sift import Sift
 from bench.runner import engines
 from bench.runner.engines import Engine
+from bench.settings import Asset
 from leaderboard import localization_results
 from leaderboard.reproduce import figures, page, run, tables
-from leaderboard.reproduce.drawing import Drawing, Scene, save
-from leaderboard.reproduce.profiles import Materials, Setting, profile
-from leaderboard.reproduce.run import Judged
+from leaderboard.reproduce.drawing import Drawing, FigureData, save
+from leaderboard.reproduce.profiles import Materials, Setting, find_profile
+from leaderboard.reproduce.run import TestSet
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -29,17 +30,17 @@ FIGURES = "figures"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Done:
-    """What was written, what a terminal shows of it, and how many photographs failed."""
+class Reproduction:
+    """The folder of the results, the output for the terminal, and the number of failed records."""
 
     out: Path
-    shown: tuple[object, ...]  # for rich
+    output: tuple[object, ...]  # for rich
     failed: int
 
 
 def reproduce(
     name: str,
-    size: str,
+    profile_name: str,
     *,
     images: Path | None,
     dataset: Dataset | None,
@@ -48,83 +49,85 @@ def reproduce(
     out: Path | None,
     workers: int | None,
     materials: Mapping[str, str],
-) -> Done:
-    """Rebuild the table `name` at the profile `size`, and write it.
+) -> Reproduction:
+    """Reproduce the table or figures `name` with the profile `profile_name`, and write the result.
 
-    Tables that share `out` share their records.
+    Tables with the same `out` share their records.
 
     Raises
     ------
     UserError
-        if a name is misspelt, or a file is missing or does not fit; nothing has been written then.
+        if a name is misspelt, or a file is missing or does not fit; nothing is written then.
     """
-    known, drawings = tables.everything(), drawn_by()
-    if name not in {**known, **drawings}:
-        raise unknown_name("table", name, [*known, *drawings])
-    sizes, table = profile(size), known.get(name)
-    of_place = name in of_places()
-    if of_place and images is not None:
-        raise UserError(f"{name} is about a place: name it with --dataset, and give no --images")
-    if not of_place and dataset is not None:
-        raise UserError(f"{name} is about photographs: name them with --images, and give no --dataset")
-    if of_place:
-        judged = run.queries(dataset or (table.place(sizes) if table and table.place else sizes.pictured))
+    definitions, drawings = tables.load_tables(), group_drawings()
+    if name not in {**definitions, **drawings}:
+        raise unknown_name("table", name, [*definitions, *drawings])
+    profile, table = find_profile(profile_name), definitions.get(name)
+    needs_dataset = takes_dataset(name)
+    if needs_dataset and images is not None:
+        raise UserError(f"{name} uses a dataset: pass it with --dataset, not --images")
+    if not needs_dataset and dataset is not None:
+        raise UserError(f"{name} uses photographs: pass them with --images, not --dataset")
+    if needs_dataset:
+        test_set = run.select_queries(dataset or (table.dataset(profile) if table and table.dataset else profile.figure_gallery))
     else:
-        judged = run.choose(images, sizes, sizes.pictures if name == FIGURES else sizes.photographs)
+        test_set = run.select_photographs(images, profile, profile.figure_photographs if name == FIGURES else profile.photographs)
     setting = Setting(
-        profile=sizes,
+        profile=profile,
         materials=Materials(**{field: Asset(file) for field, file in materials.items()}),
-        extractor=extractor or (table.extractor(sizes) if table else Sift()),
-        photographs=len(judged.chosen),
+        extractor=extractor or (table.extractor(profile) if table else Sift()),
+        photographs=len(test_set.photographs),
         seed=seed,
     )
-    folder = out or Path("runs") / f"reproduce-{sizes.name}-{_named(images, judged)}"
-    engine = engines.choose_engine(workers or (threads.cores() if of_place else 1))
+    folder = out or Path("runs") / f"reproduce-{profile.name}-{_name_folder(images, test_set)}"
+    engine = engines.choose_engine(workers or (threads.count_cores() if needs_dataset else 1))
     if table is None:
-        return _figures(name, drawings[name], setting, judged, folder, engine)
-    rebuilt = run.rebuild(table, setting, judged, folder, engine)
-    page.write(rebuilt, folder)
-    scene = Scene(setting=setting, judged=judged, ran=rebuilt.ran, out=folder)
-    every = (record for records in rebuilt.ran.records.values() for record in records)
-    files = [Text(line) for line in localization_results.write(every, folder)]
-    files += [] if table.draw is None else _drawn(name, table.draw(scene), folder)
-    return Done(out=folder, shown=(*page.to_rich(rebuilt), *files), failed=run.failures(rebuilt.ran))
+        return _reproduce_figures(name, drawings[name], setting, test_set, folder, engine)
+    reproduced = run.reproduce_table(table, setting, test_set, folder, engine)
+    page.write(reproduced, folder)
+    data = FigureData(setting=setting, test_set=test_set, result=reproduced.result, out=folder)
+    records = (record for group in reproduced.result.records.values() for record in group)
+    files = [Text(line) for line in localization_results.write(records, folder)]
+    files += [] if table.draw is None else _save_figures(name, table.draw(data), folder)
+    return Reproduction(out=folder, output=(*page.to_rich(reproduced), *files), failed=run.count_failures(reproduced.result))
 
 
-def drawn_by() -> dict[str, tuple[Drawing, ...]]:
-    """The figures that each name of the command stands for: all of photographs for one, and each of a place for itself."""
-    everything = figures.everything()
-    of_place = {f"figure-{drawing.name}": (drawing,) for drawing in everything if drawing.place}
-    return {FIGURES: tuple(drawing for drawing in everything if not drawing.place), **of_place}
+def group_drawings() -> dict[str, tuple[Drawing, ...]]:
+    """Return the figures by target: one target for all figures of photographs, one for each figure of queries."""
+    drawings = figures.load_figures()
+    of_queries = {f"figure-{drawing.name}": (drawing,) for drawing in drawings if drawing.uses_queries}
+    return {FIGURES: tuple(drawing for drawing in drawings if not drawing.uses_queries), **of_queries}
 
 
-def of_places() -> set[str]:
-    """What of the command is about the queries of a place."""
-    drawings = {name for name, drawn in drawn_by().items() if any(drawing.place for drawing in drawn)}
-    return drawings | {name for name, table in tables.everything().items() if table.place is not None}
+def takes_dataset(name: str) -> bool:
+    """Return whether the table or figure uses a dataset instead of photographs."""
+    table = tables.load_tables().get(name)
+    return any(drawing.uses_queries for drawing in group_drawings()[name]) if table is None else table.dataset is not None
 
 
-def _named(images: Path | None, judged: Judged) -> str:
-    if judged.dataset is not None:
-        return judged.dataset.name()
+def _name_folder(images: Path | None, test_set: TestSet) -> str:
+    if test_set.dataset is not None:
+        return test_set.dataset.name()
     return "builtin" if images is None else images.resolve().name
 
 
-def _figures(name: str, drawings: tuple[Drawing, ...], setting: Setting, judged: Judged, out: Path, engine: Engine) -> Done:
-    """Run the rows of these figures, and draw them into `out`/figures."""
-    rows = {row.name: row for drawing in drawings for row in drawing.rows(setting)}
-    ran = run.execute(list(rows.values()), setting, judged, out, name, engine)
-    scene = Scene(setting=setting, judged=judged, ran=ran, out=out)
-    shown = [file for drawing in drawings for file in _drawn(drawing.name, drawing.draw(scene), out)]
-    return Done(out=out, shown=tuple(shown), failed=run.failures(ran))
+def _reproduce_figures(
+    name: str, drawings: tuple[Drawing, ...], setting: Setting, test_set: TestSet, out: Path, engine: Engine
+) -> Reproduction:
+    """Run the rows of the figures, and draw them into `out`/figures."""
+    rows = {row.name: row for drawing in drawings for row in drawing.build_rows(setting)}
+    result = run.run_rows(list(rows.values()), setting, test_set, out, name, engine)
+    data = FigureData(setting=setting, test_set=test_set, result=result, out=out)
+    files = [file for drawing in drawings for file in _save_figures(drawing.name, drawing.draw(data), out)]
+    return Reproduction(out=out, output=tuple(files), failed=run.count_failures(result))
 
 
-def _drawn(name: str, drawn: Iterator[tuple[str, Figure]], out: Path) -> list[Text]:
-    """Save figures in `out`/figures. -> the paths of their files"""
-    stems = ((out / FIGURES / f"{name}-{kind}".removesuffix("-").replace("/", "-"), figure) for kind, figure in drawn)
+def _save_figures(name: str, figures: Iterator[tuple[str, Figure]], out: Path) -> list[Text]:
+    """Save figures in `out`/figures and return the paths of their files."""
+    stems = ((out / FIGURES / f"{name}-{kind}".removesuffix("-").replace("/", "-"), figure) for kind, figure in figures)
     return [Text(str(file)) for stem, figure in stems for file in save(figure, stem)]
 
 
-def materials() -> tuple[str, ...]:
-    """The names of the files that a user may give."""
+def list_materials() -> tuple[str, ...]:
+    """Return the names of the files that a user can pass."""
     return tuple(field.name for field in dataclasses.fields(Materials))

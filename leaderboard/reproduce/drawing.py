@@ -1,4 +1,4 @@
-"""What a figure of the paper is to us: rows to run, and a function that draws what came out."""
+"""Definition of a figure: rows to run, and a function that draws their records."""
 
 from __future__ import annotations
 
@@ -17,54 +17,54 @@ from bench.runner.directory import reconstruction_path
 from bench.types import Bytes
 from leaderboard.figures import Panel
 from leaderboard.reproduce.profiles import Setting
-from leaderboard.reproduce.run import Judged, Ran, of
+from leaderboard.reproduce.run import RunResult, TestSet, select_records
 from leaderboard.reproduce.study import Row
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-FORMATS = {"png": {"Software": None}, "pdf": {"CreationDate": None, "Producer": None}}  # so that a run gives the same files again
-
+# Metadata without dates and versions: the same run writes the same files.
+FORMATS = {"png": {"Software": None}, "pdf": {"CreationDate": None, "Producer": None}}
 
 SSIM = {"SSIM": "ssim"}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Scene:
-    """What a figure is drawn from."""
+class FigureData:
+    """The input of a figure."""
 
     setting: Setting
-    judged: Judged
-    ran: Ran
+    test_set: TestSet
+    result: RunResult
     out: Path
 
-    def originals(self) -> Iterator[tuple[str, Bytes]]:
-        """The names of the units that can be read, and their pixels."""
-        for unit in self.judged.units:
+    def load_originals(self) -> Iterator[tuple[str, Bytes]]:
+        """Yield the names of the readable samples, and their pixels."""
+        for sample in self.test_set.samples:
             with contextlib.suppress(SampleError):
-                yield unit.name, samples.read_pixels(unit.images[0])[0]
+                yield sample.name, samples.read_pixels(sample.images[0])[0]
 
-    def panel(self, row: str, unit: str, title: str = "", shown: Mapping[str, str] = SSIM, digits: int = 3) -> Panel:
-        """The picture made of a unit in a row of a table, with metrics beneath, by label; or why there is none."""
-        for record in of(self.ran, row):
+    def build_panel(self, row: str, sample: str, title: str = "", metrics: Mapping[str, str] = SSIM, digits: int = 3) -> Panel:
+        """Return the reconstruction of a sample in a row, with `metrics` (label -> metric) beneath, or the reason for none."""
+        for record in select_records(self.result, row):
             if record["status"] == "n/a":
                 return Panel(None, title, "n/a")
-            if record["unit"] == unit:
+            if record["sample"] == sample:
                 path = reconstruction_path(self.out, record)
-                scores = {label: record["metrics"].get(metric) for label, metric in shown.items()}
-                told = ", ".join(f"{label} {score:.{digits}f}" for label, score in scores.items() if score is not None)
-                return Panel(np.asarray(Image.open(path)) if path.is_file() else None, title, told or record["status"])
+                scores = {label: record["metrics"].get(metric) for label, metric in metrics.items()}
+                caption = ", ".join(f"{label} {score:.{digits}f}" for label, score in scores.items() if score is not None)
+                return Panel(np.asarray(Image.open(path)) if path.is_file() else None, title, caption or record["status"])
         return Panel(None, title, "not run")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Drawing:
-    """A figure, or several of a kind. `name` begins the names of its files."""
+    """A figure, or several of a kind. `name` is the prefix of its file names."""
 
     name: str
-    draw: Callable[[Scene], Iterator[tuple[str, Figure]]]  # yields what is added to the name, and the figure
-    rows: Callable[[Setting], tuple[Row, ...]] = field(default=lambda setting: ())
-    place: bool = False  # whether it is about the queries of a place; such a figure is a command of its own
+    draw: Callable[[FigureData], Iterator[tuple[str, Figure]]]  # yields suffixes of the name, and figures
+    build_rows: Callable[[Setting], tuple[Row, ...]] = field(default=lambda setting: ())
+    uses_queries: bool = False  # of a dataset; the figure is then a target of its own
 
 
 def save(figure: Figure, path: Path) -> list[Path]:

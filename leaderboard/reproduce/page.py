@@ -1,4 +1,4 @@
-"""What people read of a rebuilt table: Markdown, CSV and JSON in a folder, and tables for a terminal."""
+"""Writes a reproduced table as Markdown, CSV and JSON, and as tables for a terminal."""
 
 from __future__ import annotations
 
@@ -11,27 +11,28 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
+from bench.core.table import markdown_row
 from bench.registry import spec
 from leaderboard.intervals import LEVEL, Interval
 from leaderboard.reproduce import run
-from leaderboard.reproduce.claims import Evidence, Finding, Verdict
-from leaderboard.reproduce.run import Rebuilt
+from leaderboard.reproduce.claims import ClaimResult, Evidence, Verdict
+from leaderboard.reproduce.run import ReproducedTable
 from leaderboard.reproduce.study import Row
-from leaderboard.tables import SEEDED, extractor_label, markdown_row
+from leaderboard.tables import SEED_REMARK, label_extractor
 
 if TYPE_CHECKING:
     from rich.table import Table as RichTable
 
-DIGITS = 4  # of the numbers that speak for a verdict
-SHORT = 12  # statements of a claim that are all written out; of more, those that do not hold or cannot be told
-MOST = 12  # of these that a terminal shows
+DIGITS = 4  # of the numbers in the evidence
+FULL_LIST_LIMIT = 12  # a claim with more statements lists only those that fail or stay open
+TERMINAL_LIMIT = 12  # statements per claim in a terminal
 INTERVALS = (
-    f"In brackets: {LEVEL:.0%}, by percentile bootstrap over photographs, queries or seeds, of shares Wilson's; a verdict rests "
-    "on the bootstrap of the paired combination."
+    f"In brackets: {LEVEL:.0%}, by percentile bootstrap over photographs, queries or seeds, of fractions Wilson's; a verdict "
+    "rests on the bootstrap of the paired combination."
 )
 
 
-def write(rebuilt: Rebuilt, out: Path) -> list[Path]:
+def write(table: ReproducedTable, out: Path) -> list[Path]:
     """Write NAME.md, NAME.csv, NAME-claims.csv and NAME.json into `out` and return their paths.
 
     Raises
@@ -39,86 +40,91 @@ def write(rebuilt: Rebuilt, out: Path) -> list[Path]:
     OSError
         if one cannot be written.
     """
-    name = rebuilt.table.name
+    name = table.definition.name
     texts = {
-        f"{name}.md": markdown(rebuilt),
-        f"{name}.csv": numbers(rebuilt).to_csv(index=False, lineterminator="\n"),
-        f"{name}-claims.csv": verdicts(rebuilt).to_csv(index=False, lineterminator="\n"),
-        f"{name}.json": json.dumps(plain(rebuilt), indent=1, ensure_ascii=False, allow_nan=False) + "\n",
+        f"{name}.md": to_markdown(table),
+        f"{name}.csv": tabulate_values(table).to_csv(index=False, lineterminator="\n"),
+        f"{name}-claims.csv": tabulate_statements(table).to_csv(index=False, lineterminator="\n"),
+        f"{name}.json": json.dumps(to_json(table), indent=1, ensure_ascii=False, allow_nan=False) + "\n",
     }
     for file, text in texts.items():
         (out / file).write_text(text, encoding="utf-8", errors="replace")
     return [out / file for file in texts]
 
 
-def heading(rebuilt: Rebuilt) -> str:
-    """What was measured, on what."""
-    judged, setting = rebuilt.judged, rebuilt.setting
-    count, features = len(judged.names), extractor_label(spec.written(setting.extractor))
-    of_all = "" if count == judged.available else f" of {judged.available}"
-    first, *others = run.seeds(rebuilt.table, setting)
-    seeds = f"seeds {first} to {others[-1]}" if others else f"seed {first}"
-    return f"{rebuilt.table.title}; profile {setting.profile.name}, {count}{of_all} {judged.name}, {features} features, {seeds}"
+def format_heading(table: ReproducedTable) -> str:
+    """Return the title with profile, samples, features and seeds."""
+    test_set, setting = table.test_set, table.setting
+    count, features = len(test_set.names), label_extractor(spec.to_json(setting.extractor))
+    of_all = "" if count == test_set.available else f" of {test_set.available}"
+    first, *more = run.list_seeds(table.definition, setting)
+    seeds = f"seeds {first} to {more[-1]}" if more else f"seed {first}"
+    return (
+        f"{table.definition.title}; profile {setting.profile.name}, {count}{of_all} {test_set.name}, {features} features, {seeds}"
+    )
 
 
-def markdown(rebuilt: Rebuilt) -> str:
-    """The whole report."""
-    shown = side_by_side(rebuilt)
+def to_markdown(table: ReproducedTable) -> str:
+    """Return the whole report."""
+    values = compare_values(table)
     lines = [
-        f"# {heading(rebuilt)}",
+        f"# {format_heading(table)}",
         "",
-        markdown_row(shown.columns),
-        markdown_row("---" for _ in shown.columns),
-        *(markdown_row(row) for row in shown.itertuples(index=False)),
+        markdown_row(values.columns),
+        markdown_row("---" for _ in values.columns),
+        *(markdown_row(row) for row in values.itertuples(index=False)),
         "",
-        *(f"- {line}" for line in remarks(rebuilt)),
+        *(f"- {line}" for line in list_remarks(table)),
         "",
         "## Claims of the paper",
         "",
     ]
-    for number, finding in enumerate(rebuilt.findings, start=1):
-        lines += [f"{number}. **{finding.verdict.value}**: {finding.claim.text} {tally(finding)}", ""]
-        lines += [f"   - {line}" for line in written_out(finding)]
+    for number, result in enumerate(table.claim_results, start=1):
+        lines += [f"{number}. **{result.verdict.value}**: {result.claim.text} {count_verdicts(result)}", ""]
+        lines += [f"   - {line}" for line in list_statements(result)]
         lines.append("")
     return "\n".join(lines)
 
 
-def to_rich(rebuilt: Rebuilt) -> Iterator[RichTable]:
-    """Two tables for a terminal: the numbers, and the claims."""
+def to_rich(table: ReproducedTable) -> Iterator[RichTable]:
+    """Yield two tables for a terminal: the values and the claims."""
     from rich.table import Table as RichTable
     from rich.text import Text
 
-    shown = side_by_side(rebuilt)
-    numbers = RichTable(
-        title=Text(heading(rebuilt)), caption=Text("\n".join(remarks(rebuilt))), title_justify="left", caption_justify="left"
+    values = compare_values(table)
+    value_table = RichTable(
+        title=Text(format_heading(table)),
+        caption=Text("\n".join(list_remarks(table))),
+        title_justify="left",
+        caption_justify="left",
     )
-    for column in shown.columns:
-        numbers.add_column(column, overflow="fold", justify="left" if column in ("attack", "note") else "right")
-    for row in shown.itertuples(index=False):
-        numbers.add_row(*map(Text, row))
-    yield numbers
+    for column in values.columns:
+        value_table.add_column(column, overflow="fold", justify="left" if column in ("attack", "note") else "right")
+    for row in values.itertuples(index=False):
+        value_table.add_row(*map(Text, row))
+    yield value_table
     claims = RichTable(title=Text("Claims of the paper"), title_justify="left")
     for column in ("verdict", "claim", "evidence"):
         claims.add_column(column, overflow="fold")
-    for finding in rebuilt.findings:
-        lines = written_out(finding)
-        more = [f"and {len(lines) - MOST} more, in {rebuilt.table.name}.md"] if len(lines) > MOST else []
-        evidence = "\n".join([tally(finding), *lines[:MOST], *more])
-        claims.add_row(Text(finding.verdict.value), Text(finding.claim.text), Text(evidence))
+    for result in table.claim_results:
+        lines = list_statements(result)
+        more = [f"and {len(lines) - TERMINAL_LIMIT} more, in {table.definition.name}.md"] if len(lines) > TERMINAL_LIMIT else []
+        evidence = "\n".join([count_verdicts(result), *lines[:TERMINAL_LIMIT], *more])
+        claims.add_row(Text(result.verdict.value), Text(result.claim.text), Text(evidence))
     yield claims
 
 
-def side_by_side(rebuilt: Rebuilt) -> pd.DataFrame:
-    """Paper and ours as text, a row for each row; those borrowed from other tables come last."""
-    printed = {measure for row in rebuilt.ran.rows for measure in row.paper}
-    rows = [_shown(row, rebuilt, printed) for row in rebuilt.ran.rows]
+def compare_values(table: ReproducedTable) -> pd.DataFrame:
+    """Return the paper's values and ours as text, one line per row; reference rows come last."""
+    printed = {measure for row in table.result.rows for measure in row.paper}
+    rows = [_format_row(row, table, printed) for row in table.result.rows]
     frame = pd.DataFrame(rows).fillna("")
-    frame["note"] = [rebuilt.notes[row.name] for row in rebuilt.ran.rows]
+    frame["note"] = [table.notes[row.name] for row in table.result.rows]
     return frame if frame["note"].any() else frame.drop(columns="note")
 
 
-def numbers(rebuilt: Rebuilt) -> pd.DataFrame:
-    """A row for each cell: the paper's value and ours in full precision."""
+def tabulate_values(table: ReproducedTable) -> pd.DataFrame:
+    """Return one line per entry: the paper's value and ours in full precision."""
     return pd.DataFrame(
         [
             {
@@ -126,142 +132,142 @@ def numbers(rebuilt: Rebuilt) -> pd.DataFrame:
                 **row.labels,
                 "measure": measure,
                 "paper": row.paper.get(measure),
-                **_fields(rebuilt.ours.get((row.name, measure))),
-                "cell_id": " ".join(rebuilt.ran.cells[row.name]),
-                "note": rebuilt.notes[row.name],
+                **_interval_to_json(table.ours.get((row.name, measure))),
+                "experiment_id": " ".join(table.result.experiment_ids[row.name]),
+                "note": table.notes[row.name],
             }
-            for row in rebuilt.ran.rows
-            for measure in rebuilt.table.measures
+            for row in table.result.rows
+            for measure in table.definition.measures
         ]
     )
 
 
-def verdicts(rebuilt: Rebuilt) -> pd.DataFrame:
-    """A row for each statement of each claim, with its evidence."""
+def tabulate_statements(table: ReproducedTable) -> pd.DataFrame:
+    """Return one line per statement of each claim, with its evidence."""
     return pd.DataFrame(
         [
-            {"claim": finding.claim.text, "claim_verdict": finding.verdict.value, **_evidence(evidence)}
-            for finding in rebuilt.findings
-            for evidence in finding.evidence
+            {"claim": result.claim.text, "claim_verdict": result.verdict.value, **_evidence_to_json(evidence)}
+            for result in table.claim_results
+            for evidence in result.evidence
         ]
     )
 
 
-def plain(rebuilt: Rebuilt) -> dict[str, Any]:
-    """All of it as JSON."""
-    setting = rebuilt.setting
+def to_json(table: ReproducedTable) -> dict[str, Any]:
+    """Return the table as JSON."""
+    setting = table.setting
     return {
-        "table": rebuilt.table.name,
-        "title": rebuilt.table.title,
+        "table": table.definition.name,
+        "title": table.definition.title,
         "profile": setting.profile.name,
         "scale": setting.profile.scale,
-        "units": {"of": rebuilt.judged.name, "names": list(rebuilt.judged.names), "available": rebuilt.judged.available},
-        "dataset": None if rebuilt.judged.dataset is None else spec.written(rebuilt.judged.dataset),
-        "extractor": spec.written(setting.extractor),
-        "seeds": list(run.seeds(rebuilt.table, setting)),
-        "rows": [_row(row, rebuilt) for row in rebuilt.ran.rows],
-        "spearman": None if rebuilt.correlation is None or math.isnan(rebuilt.correlation) else rebuilt.correlation,
+        "units": {"of": table.test_set.name, "names": list(table.test_set.names), "available": table.test_set.available},
+        "dataset": None if table.test_set.dataset is None else spec.to_json(table.test_set.dataset),
+        "extractor": spec.to_json(setting.extractor),
+        "seeds": list(run.list_seeds(table.definition, setting)),
+        "rows": [_row_to_json(row, table) for row in table.result.rows],
+        "spearman": None if table.correlation is None or math.isnan(table.correlation) else table.correlation,
         "claims": [
             {
-                "claim": finding.claim.text,
-                "verdict": finding.verdict.value,
-                "statements": [_evidence(evidence) for evidence in finding.evidence],
+                "claim": result.claim.text,
+                "verdict": result.verdict.value,
+                "statements": [_evidence_to_json(evidence) for evidence in result.evidence],
             }
-            for finding in rebuilt.findings
+            for result in table.claim_results
         ],
-        "remarks": remarks(rebuilt),
+        "remarks": list_remarks(table),
     }
 
 
-def remarks(rebuilt: Rebuilt) -> list[str]:
-    """What a reader of the numbers should know."""
-    table = rebuilt.table
-    ranked = []
-    if rebuilt.correlation is not None:
-        ranked = [
-            f"Spearman's rank correlation of the paper's and our {table.ordered}, over its rows: {rebuilt.correlation:.3f}."
-        ]
-    return [*ranked, *table.notes, INTERVALS, SEEDED]
+def list_remarks(table: ReproducedTable) -> list[str]:
+    """Return the remarks below the values."""
+    definition, lines = table.definition, []
+    if table.correlation is not None:
+        measure = definition.rank_measure
+        lines = [f"Spearman's rank correlation of the paper's and our {measure}, over its rows: {table.correlation:.3f}."]
+    return [*lines, *definition.notes, INTERVALS, SEED_REMARK]
 
 
-def tally(finding: Finding) -> str:
-    """How many of a claim's statements hold."""
-    count = Counter(evidence.verdict for evidence in finding.evidence)
-    found = [f"{count[verdict]} {word}" for verdict, word in _PLURAL.items() if count[verdict]]
-    return f"(Of {len(finding.evidence)}: {', '.join(found)}.)"
+def count_verdicts(result: ClaimResult) -> str:
+    """Return how many statements of a claim have each verdict, as text."""
+    counts = Counter(evidence.verdict for evidence in result.evidence)
+    parts = [f"{counts[verdict]} {word}" for verdict, word in _PLURAL.items() if counts[verdict]]
+    return f"(Of {len(result.evidence)}: {', '.join(parts)}.)"
 
 
-def written_out(finding: Finding) -> list[str]:
-    """Its statements with their evidence, those that do not hold first; of a long list without those that hold."""
-    wanted = (Verdict.FAILS, Verdict.OPEN) if len(finding.evidence) > SHORT else (Verdict.FAILS, Verdict.OPEN, Verdict.HOLDS)
-    return [_sentence(evidence) for verdict in wanted for evidence in finding.evidence if evidence.verdict is verdict]
+def list_statements(result: ClaimResult) -> list[str]:
+    """Return the statements of a claim with their evidence, failed ones first. A long list omits those that hold."""
+    listed = (
+        (Verdict.FAILS, Verdict.OPEN) if len(result.evidence) > FULL_LIST_LIMIT else (Verdict.FAILS, Verdict.OPEN, Verdict.HOLDS)
+    )
+    return [_format_evidence(evidence) for verdict in listed for evidence in result.evidence if evidence.verdict is verdict]
 
 
 _PLURAL = {Verdict.HOLDS: "hold", Verdict.FAILS: "do not hold", Verdict.OPEN: "cannot be told"}
 
 
-def _sentence(evidence: Evidence) -> str:
+def _format_evidence(evidence: Evidence) -> str:
     paper = "" if evidence.paper is None else f"paper {evidence.paper:.{DIGITS}g}, "
-    ours = "nothing measured" if evidence.ours is None else f"ours {_written(evidence.ours, DIGITS, 'g')}"
+    ours = "nothing measured" if evidence.ours is None else f"ours {_format_interval(evidence.ours, DIGITS, 'g')}"
     reason = f" ({evidence.reason})" if evidence.reason else ""
     return f"{evidence.verdict.value}: {evidence.statement.text}: {paper}{ours}{reason}"
 
 
-def _shown(row: Row, rebuilt: Rebuilt, printed: Container[str]) -> dict[str, str]:
-    """`printed` are the measures that the paper has of some row."""
-    cells: dict[str, str] = dict(row.labels)
+def _format_row(row: Row, table: ReproducedTable, printed: Container[str]) -> dict[str, str]:
+    """Return a row as text by column. `printed` are the measures that the paper has for some row."""
+    columns: dict[str, str] = dict(row.labels)
     counts = set()
-    for measure, wanted in rebuilt.table.measures.items():
-        ours = rebuilt.ours.get((row.name, measure))
-        if measure in row.paper:
-            cells[f"{measure}, paper"] = f"{row.paper[measure]:.{wanted.digits}f}"
-        cells[f"{measure}, ours" if measure in printed else measure] = (
-            "n/a" if ours is None else _written(ours, wanted.digits, "f")
+    for name, measure in table.definition.measures.items():
+        ours = table.ours.get((row.name, name))
+        if name in row.paper:
+            columns[f"{name}, paper"] = f"{row.paper[name]:.{measure.digits}f}"
+        columns[f"{name}, ours" if name in printed else name] = (
+            "n/a" if ours is None else _format_interval(ours, measure.digits, "f")
         )
         counts |= set() if ours is None else {ours.count}
-    return cells | {"n": "/".join(map(str, sorted(counts))) or "0"}
+    return columns | {"n": "/".join(map(str, sorted(counts))) or "0"}
 
 
-def _written(value: Interval, digits: int, style: str) -> str:
+def _format_interval(value: Interval, digits: int, style: str) -> str:
     mean, low, high = (
         "∞" if math.isinf(number) else f"{number:.{digits}{style}}" for number in (value.mean, value.low, value.high)
     )
-    return mean if math.isinf(value.low) else f"{mean} [{low}, {high}]"  # of one unit alone, or a median
+    return mean if math.isinf(value.low) else f"{mean} [{low}, {high}]"  # of one sample, or a median
 
 
-def _row(row: Row, rebuilt: Rebuilt) -> dict[str, Any]:
+def _row_to_json(row: Row, table: ReproducedTable) -> dict[str, Any]:
     return {
         "name": row.name,
         "labels": dict(row.labels),
         "paper": dict(row.paper),
-        "ours": {measure: _fields(rebuilt.ours.get((row.name, measure))) for measure in rebuilt.table.measures},
-        "defense": spec.written(row.defense),
-        "attack": None if row.attack is None else spec.written(row.attack),
-        "task": spec.written(row.task),
-        "cell_ids": list(rebuilt.ran.cells[row.name]),
-        "note": rebuilt.notes[row.name],
+        "ours": {measure: _interval_to_json(table.ours.get((row.name, measure))) for measure in table.definition.measures},
+        "defense": spec.to_json(row.defense),
+        "attack": None if row.attack is None else spec.to_json(row.attack),
+        "task": spec.to_json(row.task),
+        "cell_ids": list(table.result.experiment_ids[row.name]),
+        "note": table.notes[row.name],
     }
 
 
-def _evidence(evidence: Evidence) -> dict[str, Any]:
+def _evidence_to_json(evidence: Evidence) -> dict[str, Any]:
     statement = evidence.statement
     return {
         "statement": statement.text,
-        "above": spec.finite(statement.above),
-        "below": spec.finite(statement.below),
+        "above": spec.encode_infinity(statement.above),
+        "below": spec.encode_infinity(statement.below),
         "paper": evidence.paper,
-        **_fields(evidence.ours),
+        **_interval_to_json(evidence.ours),
         "verdict": evidence.verdict.value,
         "reason": evidence.reason,
     }
 
 
-def _fields(value: Interval | None) -> dict[str, Any]:
+def _interval_to_json(value: Interval | None) -> dict[str, Any]:
     if value is None:
         return {"ours": None, "low": None, "high": None, "photographs": 0}
     return {
-        "ours": spec.finite(value.mean),
-        "low": spec.finite(value.low),
-        "high": spec.finite(value.high),
+        "ours": spec.encode_infinity(value.mean),
+        "low": spec.encode_infinity(value.low),
+        "high": spec.encode_infinity(value.high),
         "photographs": value.count,
     }

@@ -9,12 +9,12 @@ from pathlib import Path
 FOLDER = Path(__file__).parent / "paper"
 
 
-def lines(name: str) -> list[dict[str, str]]:
-    """The rows of the table in the file `name`.csv, as text by column."""
+def read_rows(name: str) -> list[dict[str, str]]:
+    """Return the rows of the table in the file `name`.csv, as text by column."""
     with (FOLDER / f"{name}.csv").open(encoding="utf-8", newline="") as file:
         return list(csv.DictReader(file))
 
 
-def numbers(line: Mapping[str, str], columns: Iterable[str]) -> dict[str, float]:
-    """Those columns of a row as numbers."""
-    return {column: float(line[column]) for column in columns}
+def parse_numbers(row: Mapping[str, str], columns: Iterable[str]) -> dict[str, float]:
+    """Return those columns of a row as numbers."""
+    return {column: float(row[column]) for column in columns}

@@ -1,4 +1,4 @@
-"""Runs the rows of a table through the runner, and weighs its claims by what came out."""
+"""Runs the rows of a table, and evaluates its claims from the records."""
 
 from __future__ import annotations
 
@@ -9,65 +9,67 @@ from pathlib import Path
 
 import pandas as pd
 
-from bench.api import Dataset, Task
+from bench.api import Dataset
 from bench.core.progress import Progress
 from bench.images import photographs, samples
 from bench.images.photographs import Source
 from bench.images.samples import Sample
-from bench.runner import plan as runner
 from bench.runner.engines import IN_PROCESS, Engine
-from bench.runner.plan import Plan
+from bench.runner.execute import execute, sort_records
+from bench.runner.plan import Plan, RunConfiguration, build_plan
 from bench.runner.records import Record
+from bench.runner.trial import dry_run
+from bench.task_api import Task
 from leaderboard.intervals import Interval, interval, proportion, rank_correlation
 from leaderboard.reproduce import study
-from leaderboard.reproduce.claims import Cell, Finding, judge
+from leaderboard.reproduce.claims import ClaimResult, TableEntry, judge_claims
 from leaderboard.reproduce.profiles import Profile, Setting
 from leaderboard.reproduce.study import Measure, Row, Table
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Judged:
-    """What a reproduction is made of: photographs, or the queries or the whole of a place."""
+class TestSet:
+    """The samples of a reproduction: photographs, or the queries or all images of a scene."""
 
-    name: str  # in words, in the plural
+    name: str  # a description in the plural
     names: tuple[str, ...]
-    available: int
-    chosen: tuple[Source, ...] = ()  # the photographs
-    dataset: Dataset | None = None  # the place
+    available: int  # how many there are
+    photographs: tuple[Source, ...] = ()  # empty for a dataset
+    dataset: Dataset | None = None  # None for photographs
 
     @property
-    def units(self) -> tuple[Sample, ...]:
-        """What records are about."""
+    def samples(self) -> tuple[Sample, ...]:
+        """The samples of the records."""
         return (
-            samples.collect_photographs(self.chosen) if self.dataset is None else samples.collect_queries(self.dataset)
+            samples.collect_photographs(self.photographs) if self.dataset is None else samples.collect_queries(self.dataset)
         ).samples
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Ran:
-    """Rows, and what the runner recorded of them."""
+class RunResult:
+    """Rows and their records."""
 
     rows: tuple[Row, ...]
-    cells: Mapping[str, tuple[str, ...]]  # row's name -> the cell_id of its records, for each seed
+    experiment_ids: Mapping[str, tuple[str, ...]]  # row's name -> the cell_id of its records, one per seed
     records: Mapping[str, tuple[Record, ...]]  # cell_id -> its records
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Rebuilt:
-    """A table beside the paper's."""
+class ReproducedTable:
+    """A reproduced table beside the paper's."""
 
-    table: Table
+    definition: Table
     setting: Setting
-    judged: Judged
-    ran: Ran
-    ours: Mapping[Cell, Interval]  # those that there are
-    notes: Mapping[str, str]  # row's name -> why it has no values, or what a reader should know of them
-    correlation: float | None  # Spearman's, over the table's own rows
-    findings: tuple[Finding, ...]
+    test_set: TestSet
+    result: RunResult
+    ours: Mapping[TableEntry, Interval]  # entries with values only
+    notes: Mapping[str, str]  # row's name -> why it has no values, or remarks on them
+    correlation: float | None  # Spearman's, without reference rows
+    claim_results: tuple[ClaimResult, ...]
 
 
-def choose(images: Path | None, profile: Profile, most: int) -> Judged:
-    """The photographs of a folder by name, or the built-in ones that the profile takes, at most so many.
+def select_photographs(images: Path | None, profile: Profile, limit: int) -> TestSet:
+    """Return the first `limit` photographs of a folder, or of the profile's built-in ones for None.
 
     Raises
     ------
@@ -75,172 +77,187 @@ def choose(images: Path | None, profile: Profile, most: int) -> Judged:
         if the folder does not exist or holds no photograph.
     """
     if images is None:
-        sources = [source for source in photographs.builtin() if profile.builtin is None or source.name in profile.builtin]
-        return _photographs("built-in photographs", sources, most)
-    return _photographs(f"photographs of {images.resolve().name}", photographs.folder(images), most)
+        sources = [source for source in photographs.list_builtin() if profile.builtin is None or source.name in profile.builtin]
+        return _build_test_set("built-in photographs", sources, limit)
+    return _build_test_set(f"photographs of {images.resolve().name}", photographs.list_photographs(images), limit)
 
 
-def _photographs(name: str, sources: Sequence[Source], most: int) -> Judged:
-    chosen = tuple(sources[:most])
-    return Judged(name=name, names=tuple(source.name for source in chosen), available=len(sources), chosen=chosen)
+def _build_test_set(name: str, sources: Sequence[Source], limit: int) -> TestSet:
+    selection = tuple(sources[:limit])
+    return TestSet(name=name, names=tuple(source.name for source in selection), available=len(sources), photographs=selection)
 
 
-def queries(dataset: Dataset) -> Judged:
-    """All queries of a place.
+def select_queries(dataset: Dataset) -> TestSet:
+    """Return all queries of a dataset.
 
     Raises
     ------
     UserError
-        if it is damaged.
+        if the dataset is damaged.
     """
     scene = dataset.scene()
     names = tuple(query.name for query in scene.queries)
-    return Judged(name=f"queries of {scene.name}", names=names, available=len(names), dataset=dataset)
+    return TestSet(name=f"queries of {scene.name}", names=names, available=len(names), dataset=dataset)
 
 
-def rebuild(table: Table, setting: Setting, judged: Judged, out: Path, engine: Engine = IN_PROCESS) -> Rebuilt:
-    """Run what `out` does not hold yet, and weigh the claims.
+def reproduce_table(table: Table, setting: Setting, test_set: TestSet, out: Path, engine: Engine = IN_PROCESS) -> ReproducedTable:
+    """Run the rows that `out` has no records of, and evaluate the claims.
 
     Raises
     ------
     UserError
-        if a file is missing or does not fit; nothing has been written then.
+        if a file is missing or does not fit; nothing is written then.
     """
-    rows = (*table.rows(setting), *table.borrowed(setting))
-    return weigh(table, setting, judged, execute(rows, setting, judged, out, table.name, engine, seeds(table, setting)))
+    rows = (*table.build_rows(setting), *table.build_reference_rows(setting))
+    result = run_rows(rows, setting, test_set, out, table.name, engine, list_seeds(table, setting))
+    return compare_with_paper(table, setting, test_set, result)
 
 
-def seeds(table: Table, setting: Setting) -> range:
-    """That a table is done with."""
-    return range(setting.seed, setting.seed + (setting.profile.seeds if table.repeated else 1))
+def list_seeds(table: Table, setting: Setting) -> range:
+    """Return the seeds of a table's rows."""
+    return range(setting.seed, setting.seed + (setting.profile.seeds if table.multiple_seeds else 1))
 
 
-def execute(
+def run_rows(
     rows: Sequence[Row],
     setting: Setting,
-    judged: Judged,
+    test_set: TestSet,
     out: Path,
     title: str,
     engine: Engine = IN_PROCESS,
     seeds: Iterable[int] | None = None,
-) -> Ran:
-    """Run the rows, one plan for each task and seed, that of the setting alone for None.
+) -> RunResult:
+    """Run the rows, one plan per task and seed. `seeds` None: the seed of the setting.
 
-    Records that `out` holds are not made again.
+    Records in `out` are reused.
     """
-    tasks, each = dict.fromkeys(row.task for row in rows), (setting.seed,) if seeds is None else seeds
-    plans = [_plan(task, rows, setting, judged, seed) for seed in each for task in tasks]
-    cells = {row.name: _cells(row, plans) for row in rows}
-    found: list[Record] = []
-    with Progress(f"{title}: {len(judged.names)} {judged.name}, {len(rows)} rows", sum(map(len, plans))) as progress:
-        for record in runner.execute(plans, out, engine):
-            found.append(record)
-            progress.advance(note=record["unit"])
+    tasks = dict.fromkeys(row.task for row in rows)
+    plans = [
+        _plan_task(task, rows, setting, test_set, seed)
+        for seed in ((setting.seed,) if seeds is None else seeds)
+        for task in tasks
+    ]
+    experiment_ids = {row.name: _list_experiment_ids(row, plans) for row in rows}
+    unordered: list[Record] = []
+    with Progress(f"{title}: {len(test_set.names)} {test_set.name}, {len(rows)} rows", sum(map(len, plans))) as progress:
+        for record in execute(plans, out, engine):
+            unordered.append(record)
+            progress.advance(note=record["sample"])
             if record["status"] == "failed":
-                progress.say(f"bench: failed: {record['unit']}, {record['defense']['name']}: {record['reason']}")
+                progress.log(f"bench: failed: {record['sample']}, {record['defense']['name']}: {record['reason']}")
     records: dict[str, list[Record]] = {}
-    for record in runner.sort_records(plans, found):
-        records.setdefault(record["cell_id"], []).append(record)
-    return Ran(rows=tuple(rows), cells=cells, records={cell: tuple(its) for cell, its in records.items()})
-
-
-def weigh(table: Table, setting: Setting, judged: Judged, ran: Ran) -> Rebuilt:
-    """Means, intervals, rank correlation and verdicts from records alone."""
-    reasons = {row.name: reason for row in ran.rows if (reason := _reason(of(ran, row.name)))}
-    columns = _columns(table, ran)
-    paper = study.printed(ran.rows)
-    ours = {cell: _interval(table.measures[cell[1]], column) for cell, column in columns.items() if len(column)}
-    return Rebuilt(
-        table=table,
-        setting=setting,
-        judged=judged,
-        ran=ran,
-        ours=ours,
-        notes={row.name: reasons.get(row.name) or _notes(of(ran, row.name)) for row in ran.rows},
-        correlation=_correlation(table, table.rows(setting), ours),
-        findings=judge(table.claims(paper), pd.DataFrame(columns), paper, reasons),
+    for record in sort_records(plans, unordered):
+        records.setdefault(record["experiment_id"], []).append(record)
+    return RunResult(
+        rows=tuple(rows), experiment_ids=experiment_ids, records={key: tuple(group) for key, group in records.items()}
     )
 
 
-def of(ran: Ran, row: str) -> tuple[Record, ...]:
-    """The records of a row, those of the first seed first."""
-    return tuple(record for cell in ran.cells[row] for record in ran.records.get(cell, ()))
+def compare_with_paper(table: Table, setting: Setting, test_set: TestSet, result: RunResult) -> ReproducedTable:
+    """Return means, intervals, rank correlation and verdicts, computed from records alone."""
+    reasons = {row.name: reason for row in result.rows if (reason := _explain_missing(select_records(result, row.name)))}
+    columns = _collect_values(table, result)
+    paper = study.collect_paper_values(result.rows)
+    ours = {entry: _compute_interval(table.measures[entry[1]], column) for entry, column in columns.items() if len(column)}
+    return ReproducedTable(
+        definition=table,
+        setting=setting,
+        test_set=test_set,
+        result=result,
+        ours=ours,
+        notes={row.name: reasons.get(row.name) or _summarize_notes(select_records(result, row.name)) for row in result.rows},
+        correlation=_correlate_ranks(table, table.build_rows(setting), ours),
+        claim_results=judge_claims(table.build_claims(paper), pd.DataFrame(columns), paper, reasons),
+    )
 
 
-def failures(ran: Ran) -> int:
-    """Records of photographs that could not be done."""
-    return sum(record["status"] == "failed" for records in ran.records.values() for record in records)
+def select_records(result: RunResult, row: str) -> tuple[Record, ...]:
+    """Return the records of a row, ordered by seed."""
+    return tuple(record for key in result.experiment_ids[row] for record in result.records.get(key, ()))
 
 
-def _value(measure: Measure, record: Record) -> float | None:
+def count_failures(result: RunResult) -> int:
+    """Return the number of failed records."""
+    return sum(record["status"] == "failed" for records in result.records.values() for record in records)
+
+
+def _get_value(measure: Measure, record: Record) -> float | None:
     value: float | None = record["metrics"].get(measure.metric)
     worst = math.inf if measure.median and measure.metric in record["metrics"] else None
     return worst if value is None else value
 
 
-def _interval(measure: Measure, column: pd.Series) -> Interval:
+def _compute_interval(measure: Measure, column: pd.Series) -> Interval:
     if measure.median:
         return Interval(float(column.median()), -math.inf, math.inf, len(column))
-    return proportion(column / measure.times, measure.times) if measure.share else interval(column)
+    return proportion(column / measure.factor, measure.factor) if measure.fraction else interval(column)
 
 
-def _plan(task: Task, rows: Sequence[Row], setting: Setting, judged: Judged, seed: int) -> Plan:
+def _plan_task(task: Task, rows: Sequence[Row], setting: Setting, test_set: TestSet, seed: int) -> Plan:
     pairs = [(row.defense, row.attack) for row in rows if row.task == task]
     defenses = list(dict.fromkeys(defense for defense, _ in pairs))
-    pairs.sort(key=lambda pair: defenses.index(pair[0]))  # so that each photograph is protected once by each
-    return runner.prepare_pairs(
-        pairs, judged.chosen or None, task=task, extractor=setting.extractor, dataset=judged.dataset, seed=seed
+    pairs.sort(key=lambda pair: defenses.index(pair[0]))  # so that each defense protects each photograph once
+    configuration = RunConfiguration(
+        pairs=tuple(pairs),
+        images=test_set.photographs or None,
+        task=task,
+        extractor=setting.extractor,
+        dataset=test_set.dataset,
+        seed=seed,
     )
+    plan = build_plan(configuration)
+    dry_run(plan)
+    return plan
 
 
-def _cells(row: Row, plans: Sequence[Plan]) -> tuple[str, ...]:
+def _list_experiment_ids(row: Row, plans: Sequence[Plan]) -> tuple[str, ...]:
     return tuple(
-        str(cell.metadata["cell_id"])
+        str(experiment.metadata["experiment_id"])
         for plan in plans
-        for cell in plan.experiments
-        if (plan.task, cell.defense, cell.attack) == (row.task, row.defense, row.attack)
+        for experiment in plan.experiments
+        if (plan.task, experiment.defense, experiment.attack) == (row.task, row.defense, row.attack)
     )
 
 
-def _columns(table: Table, ran: Ran) -> dict[Cell, pd.Series]:
-    """The values of each cell by unit and seed, in the paper's unit of measurement."""
+def _collect_values(table: Table, result: RunResult) -> dict[TableEntry, pd.Series]:
+    """Return the values of each entry by sample and seed, in the paper's unit of measurement."""
     return {
-        (row.name, measure): pd.Series(
+        (row.name, name): pd.Series(
             {
-                f"{record['unit']} {record['seed']}": value * wanted.times
-                for record in of(ran, row.name)
-                if record["status"] == "ok" and wanted.condition in (None, record.get("condition"))
-                if (value := _value(wanted, record)) is not None
+                f"{record['sample']} {record['seed']}": value * measure.factor
+                for record in select_records(result, row.name)
+                if record["status"] == "ok" and measure.condition in (None, record.get("condition"))
+                if (value := _get_value(measure, record)) is not None
             },
             dtype=float,
         )
-        for row in ran.rows
-        for measure, wanted in table.measures.items()
+        for row in result.rows
+        for name, measure in table.measures.items()
     }
 
 
-def _correlation(table: Table, rows: Iterable[Row], ours: Mapping[Cell, Interval]) -> float | None:
-    if table.ordered is None:
+def _correlate_ranks(table: Table, rows: Iterable[Row], ours: Mapping[TableEntry, Interval]) -> float | None:
+    if table.rank_measure is None:
         return None
-    both = [
-        (row.paper[table.ordered], ours[row.name, table.ordered].mean)
+    pairs = [
+        (row.paper[table.rank_measure], ours[row.name, table.rank_measure].mean)
         for row in rows
-        if table.ordered in row.paper and (row.name, table.ordered) in ours
+        if table.rank_measure in row.paper and (row.name, table.rank_measure) in ours
     ]
-    return rank_correlation(*zip(*both, strict=True)) if len(both) > 1 else None
+    return rank_correlation(*zip(*pairs, strict=True)) if len(pairs) > 1 else None
 
 
-def _reason(records: Sequence[Record]) -> str | None:
-    """Why a row has no values; None if it has some."""
+def _explain_missing(records: Sequence[Record]) -> str | None:
+    """Return why a row has no values; None if it has some."""
     if any(record["status"] == "ok" for record in records):
         return None
-    told = dict.fromkeys(str(record["reason"]) for record in records)
-    return "n/a: " + "; ".join(told) if told else "n/a"
+    reasons = dict.fromkeys(str(record["reason"]) for record in records)
+    return "n/a: " + "; ".join(reasons) if reasons else "n/a"
 
 
-def _notes(records: Sequence[Record]) -> str:
-    """What all photographs of a row share, and how many failed."""
-    done = [record for record in records if record["status"] == "ok"]
-    shared = [note for note in done[0]["notes"] if all(note in record["notes"] for record in done)]
-    failed = len(records) - len(done)
-    return "; ".join([*([f"{failed} failed"] if failed else []), *shared])
+def _summarize_notes(records: Sequence[Record]) -> str:
+    """Return the notes that all samples of a row share, and how many samples failed."""
+    succeeded = [record for record in records if record["status"] == "ok"]
+    common = [note for note in succeeded[0]["notes"] if all(note in record["notes"] for record in succeeded)]
+    failed = len(records) - len(succeeded)
+    return "; ".join([*([f"{failed} failed"] if failed else []), *common])

@@ -1,7 +1,7 @@
-"""Smaller dictionaries at the same chance of the truth: every |K| times s, every ε plus ln s.
+"""Smaller dictionaries at the same probability of the true word: every |K| is multiplied by s, every ε is increased by ln s.
 
-The chance that the true word is in its set, m e^ε / (m e^ε + |K| − m), depends on |K| and ε through |K| e^-ε alone (but for the
-− m), which s |K| and ε + ln s leave as it is. The guarantee does not stay: the smaller table's ε is a smaller ε.
+The probability that the true word is in its set is m e^ε / (m e^ε + |K| − m). Apart from the − m it depends on |K| and ε through
+|K| e^-ε alone, which s |K| and ε + ln s leave unchanged. The guarantee changes: the smaller table has a smaller ε.
 """
 
 from __future__ import annotations
@@ -10,10 +10,10 @@ import math
 
 
 def words(paper: int, factor: float) -> int:
-    """Our |K| for the paper's."""
+    """Return our |K| for the paper's."""
     return round(paper * factor)
 
 
 def epsilon(paper: float, factor: float) -> float:
-    """Our ε for the paper's."""
+    """Return our ε for the paper's."""
     return paper + math.log(factor)

@@ -9,25 +9,25 @@ from leaderboard.reproduce import run, tables
 from leaderboard.reproduce.profiles import CPU, Materials, Setting
 
 
-def of_table(name: str) -> Suite:
-    """The rows of a table, and those of others that its claims compare with, with what is shipped: photographs or a place.
+def build_suite(name: str) -> Suite:
+    """Return the suite of a table's rows and reference rows, with the shipped files and the profile `cpu`.
 
-    Records are those of `bench reproduce`, which finds them if it is given the folder.
+    `bench reproduce` reuses its records if `--out` names the same folder.
     """
-    table = tables.everything()[name]
+    table = tables.load_tables()[name]
     extractor = table.extractor(CPU)
-    setting = Setting(profile=CPU, materials=Materials(), extractor=extractor, photographs=len(photographs.builtin()))
-    rows = (*table.rows(setting), *table.borrowed(setting))
+    setting = Setting(profile=CPU, materials=Materials(), extractor=extractor, photographs=len(photographs.list_builtin()))
+    rows = (*table.build_rows(setting), *table.build_reference_rows(setting))
     parts = [
         RunConfiguration(
             pairs=tuple((row.defense, row.attack) for row in rows if row.task == task),
             images=None,
             task=task,
             extractor=extractor,
-            dataset=None if table.place is None else table.place(CPU),
+            dataset=None if table.dataset is None else table.dataset(CPU),
             seed=seed,
         )
-        for seed in run.seeds(table, setting)
+        for seed in run.list_seeds(table, setting)
         for task in dict.fromkeys(row.task for row in rows)
     ]
     return Suite(summary=table.title, parts=tuple(parts))

@@ -1,5 +1,5 @@
-"""The leaderboard as a folder: tables, plots, and a page that needs no network. All of it is made from records alone."""
+"""The leaderboard as a folder, from records alone: tables, plots, and a page that needs no network."""
 
-from leaderboard.site.write import Done, write
+from leaderboard.site.write import WrittenSite, write
 
-__all__ = ["Done", "write"]
+__all__ = ["WrittenSite", "write"]

@@ -1,4 +1,4 @@
-"""The privacy–utility plot as numbers that a template draws: where each point, label, tick and the Pareto front lie."""
+"""The privacy–utility plot of the page: the coordinates of points, labels, ticks and the Pareto front for a template."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from leaderboard.intervals import Interval
-from leaderboard.plot_style import Mark, place_labels
-from leaderboard.plots import family_marks, settings
-from leaderboard.tables import number
+from leaderboard.plot_style import PlotStyle, place_labels
+from leaderboard.plots import choose_family_styles, label_points
+from leaderboard.tables import format_number
 from leaderboard.tradeoff import Point, Tradeoff
 
 WIDTH, HEIGHT = 520, 380  # of the whole, in the units of its viewBox
@@ -21,34 +21,34 @@ MARGIN = 0.12  # of the plot, around the points
 
 @dataclass(frozen=True, kw_only=True)
 class Tick:
-    at: float
+    position: float
     text: str
 
 
 @dataclass(frozen=True, kw_only=True)
 class Spot:
-    """A point as it is drawn."""
+    """A point in the coordinates of the plot."""
 
     point: Point
     x: float
     y: float
     bars: tuple[tuple[float, float, float, float], ...]  # lines of its intervals: x1, y1, x2, y2
-    mark: Mark
-    told: str  # for who does not see it
+    style: PlotStyle
+    description: str  # for screen readers
     label: str
-    label_at: tuple[float, float] | None
+    label_position: tuple[float, float] | None
 
 
 @dataclass(frozen=True, kw_only=True)
 class Chart:
     """One plot."""
 
-    found: Tradeoff
+    tradeoff: Tradeoff
     spots: tuple[Spot, ...]
     across: tuple[Tick, ...]
     up: tuple[Tick, ...]
     front: str  # the d of an SVG path
-    legend: tuple[tuple[str, Mark], ...]
+    legend: tuple[tuple[str, PlotStyle], ...]
     width: int = WIDTH
     height: int = HEIGHT
     box: tuple[int, int, int, int] = (LEFT, TOP, WIDTH - RIGHT, HEIGHT - BOTTOM)  # left, top, right, bottom of the plot
@@ -56,7 +56,7 @@ class Chart:
 
 @dataclass(frozen=True)
 class Scale:
-    """A linear scale from values to places."""
+    """A linear scale from values to coordinates."""
 
     low: float
     high: float
@@ -71,49 +71,54 @@ class Scale:
 
         values = MaxNLocator(TICKS, steps=[1, 2, 5, 10]).tick_values(self.low, self.high)
         decimals = max(0, -math.floor(math.log10(values[1] - values[0]) + 1e-9))
-        return tuple(Tick(at=self(value), text=f"{value:.{decimals}f}") for value in values if self.low <= value <= self.high)
+        return tuple(Tick(position=self(value), text=f"{value:.{decimals}f}") for value in values if self.low <= value <= self.high)
 
 
-def charts(found: Sequence[Tradeoff]) -> list[Chart]:
-    """Lay the plots of one board out, side by side on the same scales, so that they can be compared."""
-    points = [point for one in found for point in one.points]
+def build_charts(tradeoffs: Sequence[Tradeoff]) -> list[Chart]:
+    """Return the charts of one group. All have the same scales, so that they can be compared."""
+    points = [point for tradeoff in tradeoffs for point in tradeoff.points]
     if not points:
         return []
-    x = _scale([point.utility for point in points], LEFT, WIDTH - RIGHT)
-    y = _scale([point.privacy for point in points], HEIGHT - BOTTOM, TOP)
-    return [_chart(one, x, y) for one in found]
+    x = _fit_scale([point.utility for point in points], LEFT, WIDTH - RIGHT)
+    y = _fit_scale([point.privacy for point in points], HEIGHT - BOTTOM, TOP)
+    return [_build_chart(tradeoff, x, y) for tradeoff in tradeoffs]
 
 
-def _chart(found: Tradeoff, x: Scale, y: Scale) -> Chart:
-    places = [(x(point.utility.mean), y(point.privacy.mean)) for point in found.points]
-    texts = settings(found)
+def _build_chart(tradeoff: Tradeoff, x: Scale, y: Scale) -> Chart:
+    positions = [(x(point.utility.mean), y(point.privacy.mean)) for point in tradeoff.points]
+    texts = label_points(tradeoff)
     labels = place_labels(
-        [(across - LEFT, up - TOP) for across, up in places],
+        [(across - LEFT, up - TOP) for across, up in positions],
         [(LETTER[0] * len(text), LETTER[1]) for text in texts],
         (WIDTH - LEFT - RIGHT, HEIGHT - TOP - BOTTOM),
         gap=11.0,
     )
-    chosen = family_marks(found)
+    styles = choose_family_styles(tradeoff)
     spots = tuple(
         Spot(
             point=point,
-            x=place[0],
-            y=place[1],
-            bars=_bars(point, x, y),
-            mark=chosen[point.standing.configuration["name"]],
-            told=_told(found, point),
+            x=position[0],
+            y=position[1],
+            bars=_draw_bars(point, x, y),
+            style=styles[point.standing.configuration["name"]],
+            description=_describe(tradeoff, point),
             label=text,
-            label_at=label and (round(label[0] + LEFT, 1), round(label[1] + TOP, 1)),
+            label_position=label and (round(label[0] + LEFT, 1), round(label[1] + TOP, 1)),
         )
-        for point, place, text, label in zip(found.points, places, texts, labels, strict=True)
+        for point, position, text, label in zip(tradeoff.points, positions, texts, labels, strict=True)
     )
     return Chart(
-        found=found, spots=spots, across=x.ticks(), up=y.ticks(), front=_steps(found.front, x, y), legend=tuple(chosen.items())
+        tradeoff=tradeoff,
+        spots=spots,
+        across=x.ticks(),
+        up=y.ticks(),
+        front=_draw_front(tradeoff.front, x, y),
+        legend=tuple(styles.items()),
     )
 
 
-def _scale(values: Sequence[Interval], start: float, end: float) -> Scale:
-    """Of all means and intervals, with some room around the means."""
+def _fit_scale(values: Sequence[Interval], start: float, end: float) -> Scale:
+    """Return a scale that shows all means and intervals, with some room around the means."""
     means = [value.mean for value in values]
     room = (max(means) - min(means)) * MARGIN or 0.05
     low = min([min(means) - room, *(value.low for value in values if math.isfinite(value.low))])
@@ -121,7 +126,7 @@ def _scale(values: Sequence[Interval], start: float, end: float) -> Scale:
     return Scale(low, high, start, end)
 
 
-def _bars(point: Point, x: Scale, y: Scale) -> tuple[tuple[float, float, float, float], ...]:
+def _draw_bars(point: Point, x: Scale, y: Scale) -> tuple[tuple[float, float, float, float], ...]:
     across, up, bars = point.utility, point.privacy, []
     if math.isfinite(across.low):
         bars.append((x(across.low), y(up.mean), x(across.high), y(up.mean)))
@@ -130,8 +135,8 @@ def _bars(point: Point, x: Scale, y: Scale) -> tuple[tuple[float, float, float, 
     return tuple(bars)
 
 
-def _steps(front: Sequence[Point], x: Scale, y: Scale) -> str:
-    """Up and then across: what is further right costs as much as the next point of the front."""
+def _draw_front(front: Sequence[Point], x: Scale, y: Scale) -> str:
+    """Return an SVG path, up and then across: what is further right costs as much as the next point of the front."""
     path = ""
     for point in front:
         across, up = x(point.utility.mean), y(point.privacy.mean)
@@ -139,11 +144,11 @@ def _steps(front: Sequence[Point], x: Scale, y: Scale) -> str:
     return path
 
 
-def _told(found: Tradeoff, point: Point) -> str:
+def _describe(tradeoff: Tradeoff, point: Point) -> str:
     standing = point.standing
     rank = f"rank {standing.rank}" if standing.rank is not None else "unranked"
     return (
-        f"{standing.defense}, {rank}: {found.utility.label} {number(point.utility.mean)}, "
-        f"{found.privacy.label} {number(point.privacy.mean)} by {point.cell.attack}"
-        + (", on the Pareto front" if point.best else "")
+        f"{standing.defense}, {rank}: {tradeoff.utility.label} {format_number(point.utility.mean)}, "
+        f"{tradeoff.privacy.label} {format_number(point.privacy.mean)} by {point.attack_experiment.attack}"
+        + (", on the Pareto front" if point.on_front else "")
     )

@@ -1,4 +1,4 @@
-"""What the page shows of one cell: numbers, pictures, budget, configuration, environment, and the command that makes it again."""
+"""The page's view of one experiment: numbers, images, budget, configuration, environment, and the command that repeats it."""
 
 from __future__ import annotations
 
@@ -10,37 +10,37 @@ from statistics import median
 from typing import Any
 
 from bench.mechanisms.composition import DELTA
-from leaderboard.comparison import Board, Cell
-from leaderboard.group_tables import Column, Row, Sheet, Value, guarantee, middle, shown
+from leaderboard.comparison import ComparisonGroup, GroupedExperiment
+from leaderboard.group_tables import GroupColumn, GroupRow, GroupTable, Value, comparable_number, describe_guarantee
 from leaderboard.intervals import Interval
 from leaderboard.measures import PRIVACY
-from leaderboard.recipe import Lookup, Recipe, recipe
+from leaderboard.recipe import Lookup, Recipe, build_recipe
 from leaderboard.site import pictures
 from leaderboard.site.pictures import Pair
-from leaderboard.tables import LEFT_TO_FILES, number, spaced
+from leaderboard.tables import FILE_ONLY_COLUMNS, add_breaks, format_number
 from leaderboard.tradeoff import Tradeoff
 
-UNTOLD = ("log10_true", *(name.lower() for name in LEFT_TO_FILES))  # columns that the page's table has no room for
-FAILURES = 5  # that are told of a cell
+HIDDEN_COLUMNS = ("log10_true", *(name.lower() for name in FILE_ONLY_COLUMNS))  # the page's table has no room for them
+MAX_FAILURES = 5  # that are listed of an experiment
 
 
 @dataclass(frozen=True, kw_only=True)
 class Picture:
-    """One unit of a cell, to be compared with the photograph."""
+    """The reconstruction of one sample, to be compared with the photograph."""
 
-    unit: str
+    sample: str
     score: str
     files: Pair
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class View:
-    """One cell as the page shows it."""
+    """One experiment as the page shows it."""
 
-    row: Row
+    row: GroupRow
     label: tuple[str, str]  # the defense's name, and its settings
     texts: dict[str, tuple[str, str]]  # column -> the number and its interval
-    values: dict[str, str]  # column -> what it is sorted by; nothing where there is no value
+    values: dict[str, str]  # column -> its sort key; "" where there is no value
     best: frozenset[str]  # columns in which it is the best
     pictures: tuple[Picture, ...]
     budget: tuple[tuple[str, str], ...]
@@ -48,124 +48,134 @@ class View:
     recipe: Recipe
     settings: tuple[tuple[str, tuple[tuple[str, str], ...]], ...]  # heading, and names with values
     failures: tuple[str, ...]
-    beside: tuple[tuple[str, str], ...]  # what a server can do with the same release: text, and the key of that cell
+    utilities: tuple[tuple[str, str], ...]  # of the same release for a server: text, and the key of that experiment
 
     @property
-    def cell(self) -> Cell:
-        return self.row.cell
+    def experiment(self) -> GroupedExperiment:
+        return self.row.experiment
 
 
-def columns(sheet: Sheet) -> list[Column]:
-    """Those that the page's table shows: what is judged, and what says of what it is."""
-    head = ("rank", "defense", "guarantee", "epsilon_descriptor", "epsilon_image", "attack")
-    return [
-        column for column in sheet.columns if column.name in (*head, "units") or (column.better and column.name not in UNTOLD)
-    ]
+def select_columns(table: GroupTable) -> list[GroupColumn]:
+    """Return the columns of the page's table: the judged measures, and what identifies a row."""
+    names = ("rank", "defense", "guarantee", "epsilon_descriptor", "epsilon_image", "attack", "units")
+    return [column for column in table.columns if column.name in names or (column.better and column.name not in HIDDEN_COLUMNS)]
 
 
-def view(board: Board, sheet: Sheet, row: Row, found: Sequence[Tradeoff], out: Path, lookup: Lookup) -> View:
-    """Gather what there is to show of a row of the board, and copy its pictures into `out`."""
-    cell = row.cell
-    name, _, fields = cell.defense.partition(":")
+def build_view(
+    group: ComparisonGroup, table: GroupTable, row: GroupRow, tradeoffs: Sequence[Tradeoff], out: Path, lookup: Lookup
+) -> View:
+    """Return the view of a row of the group's table, and copy its images into `out`."""
+    experiment = row.experiment
+    name, _, fields = experiment.defense.partition(":")
+    texts = {
+        column.name: _split_interval(text, row.values[column.name]) for column, text in zip(table.columns, row.texts, strict=True)
+    }
     return View(
         row=row,
-        label=(name, spaced(fields)),
-        texts={column.name: _parts(column, row) for column in sheet.columns} | {"attack": (spaced(cell.attack), "")},
-        values={column.name: _sorted_by(row.values[column.name]) for column in sheet.columns},
-        best=frozenset(column.name for column in sheet.columns if sheet.is_best(column, row)),
-        pictures=tuple(_pictures(board, cell, out)),
-        budget=tuple(_budget(cell)),
-        uncovered=tuple(map(str, cell.head["privacy"].get("uncovered", ()))),
-        recipe=recipe(cell, lookup),
-        settings=tuple(_settings(cell)),
-        failures=tuple(_failures(cell)),
-        beside=tuple(_beside(cell, found)),
+        label=(name, add_breaks(fields)),
+        texts=texts | {"attack": (add_breaks(experiment.attack), "")},
+        values={column.name: _sort_key(row.values[column.name]) for column in table.columns},
+        best=frozenset(table.columns[index].name for index in row.best),
+        pictures=tuple(_list_pictures(group, experiment, out)),
+        budget=tuple(_list_budget(experiment)),
+        uncovered=tuple(map(str, experiment.metadata["privacy"].get("uncovered", ()))),
+        recipe=build_recipe(experiment, lookup),
+        settings=tuple(_list_settings(experiment)),
+        failures=tuple(_list_failures(experiment)),
+        utilities=tuple(_list_utilities(experiment, tradeoffs)),
     )
 
 
-def _parts(column: Column, row: Row) -> tuple[str, str]:
-    """The number, and its interval if it has one."""
-    text = shown(column, row)
-    if not isinstance(row.values[column.name], Interval):
+def _split_interval(text: str, value: Value) -> tuple[str, str]:
+    """Return the number, and its interval if it has one."""
+    if not isinstance(value, Interval):
         return text, ""
     mean, _, ends = text.partition(" ")
     return mean, ends.replace(", ", ",\N{NO-BREAK SPACE}").replace(" = ", "\N{NO-BREAK SPACE}=\N{NO-BREAK SPACE}")
 
 
-def _sorted_by(value: Value) -> str:
-    """What a column is sorted by; nothing where there is no value."""
-    number = middle(value)
+def _sort_key(value: Value) -> str:
+    """Return what a column is sorted by; "" where there is no value."""
+    number = comparable_number(value)
     return ("" if value is None else str(value)) if number is None else repr(number)
 
 
-def _pictures(board: Board, cell: Cell, out: Path) -> Iterator[Picture]:
-    for record, files in pictures.pairs(cell.found, out):
+def _list_pictures(group: ComparisonGroup, experiment: GroupedExperiment, out: Path) -> Iterator[Picture]:
+    for record, files in pictures.write_pairs(experiment.records, out):
         score = record["metrics"].get(PRIVACY)
-        unit = record["unit"] if len(board.seeds) == 1 else f"{record['unit']}, seed {record['seed']}"
-        yield Picture(unit=unit, score="" if score is None else f"SSIM {number(score)}", files=files)
+        sample = record["sample"] if len(group.seeds) == 1 else f"{record['sample']}, seed {record['seed']}"
+        yield Picture(sample=sample, score="" if score is None else f"SSIM {format_number(score)}", files=files)
 
 
-def _budget(cell: Cell) -> Iterator[tuple[str, str]]:
-    """What the photographs spend: by both compositions, the median and the range over the photographs."""
-    privacy = cell.head["privacy"]
-    yield "guarantee", guarantee(cell.head)
+def _list_budget(experiment: GroupedExperiment) -> Iterator[tuple[str, str]]:
+    """Yield the guarantee and the budget of an image: its median and range over the photographs, by both compositions."""
+    privacy = experiment.metadata["privacy"]
+    yield "guarantee", describe_guarantee(experiment.metadata)
     if privacy["epsilon_descriptor"] is None:
         return
-    yield "ε of a descriptor", number(float(privacy["epsilon_descriptor"]))
+    yield "ε of a descriptor", format_number(float(privacy["epsilon_descriptor"]))
     kinds = {"epsilon_image": "basic composition", "epsilon_image_optimal": f"optimal composition at δ = {DELTA:g}"}
     for name, words in kinds.items():
-        spent = [float(value) for record in cell.done if (value := record["privacy"].get(name)) is not None]
-        if spent:
-            yield f"ε of an image, {words}", f"{number(median(spent))} ({number(min(spent))} to {number(max(spent))})"
-    keypoints = [record["privacy"]["keypoints"] for record in cell.done if record["privacy"].get("keypoints") is not None]
-    if keypoints:
+        if epsilons := [float(value) for value in _list_privacy(experiment, name)]:
+            middle, least, most = map(format_number, (median(epsilons), min(epsilons), max(epsilons)))
+            yield f"ε of an image, {words}", f"{middle} ({least} to {most})"
+    if keypoints := _list_privacy(experiment, "keypoints"):
         yield "descriptors of an image", f"{median(keypoints):g} ({min(keypoints)} to {max(keypoints)})"
     yield "releases of an image that the attacker sees", str(privacy.get("releases", 1))
 
 
-def _settings(cell: Cell) -> Iterator[tuple[str, tuple[tuple[str, str], ...]]]:
-    head = cell.head
-    dataset = {name: value for name, value in head["dataset"].items() if name != "extractor"}
+def _list_privacy(experiment: GroupedExperiment, name: str) -> list[Any]:
+    values = (record["privacy"].get(name) for record in experiment.completed)
+    return [value for value in values if value is not None]
+
+
+def _list_settings(experiment: GroupedExperiment) -> Iterator[tuple[str, tuple[tuple[str, str], ...]]]:
+    metadata = experiment.metadata
+    dataset = {name: value for name, value in metadata["dataset"].items() if name != "extractor"}
     parts = {
-        "Defense": head["defense"],
-        "Attack": head["attack"] or {},
-        "Task": {"name": head["task"], **(head.get("task_settings") or {})},
+        "Defense": metadata["defense"],
+        "Attack": metadata["attack"] or {},
+        "Task": {"name": metadata["task"], **(metadata.get("task_settings") or {})},
         "Data": dataset,
-        "Extractor": head["dataset"]["extractor"],
-        "Metrics": head["metric_settings"],
-        "Run": {name: sorted({str(one.record[name]) for one in cell.found}) for name in ("cell_id", "run_hash", "seed")},
-        "Environment": head["environment"],
+        "Extractor": metadata["dataset"]["extractor"],
+        "Metrics": metadata["metric_settings"],
+        "Run": {
+            name: sorted({str(located.record[name]) for located in experiment.records})
+            for name in ("experiment_id", "run_hash", "seed")
+        },
+        "Environment": metadata["environment"],
     }
     for heading, content in parts.items():
-        if lines := tuple(_flat(content)):
+        if lines := tuple(_flatten(content)):
             yield heading, lines
 
 
-def _flat(content: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, str]]:
-    """Nested names with points between them."""
+def _flatten(content: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, str]]:
+    """Yield nested fields as `outer.inner`, with their values."""
     for name, value in content.items():
         if isinstance(value, Mapping):
-            yield from _flat(value, f"{before}{name}.")
+            yield from _flatten(value, f"{before}{name}.")
         else:
-            yield f"{before}{name}", ", ".join(map(_plain, value)) if isinstance(value, list) else _plain(value)
+            yield f"{before}{name}", ", ".join(map(_format_value, value)) if isinstance(value, list) else _format_value(value)
 
 
-def _plain(value: Any) -> str:
-    """As records hold it."""
+def _format_value(value: Any) -> str:
+    """Return a value as records write it."""
     return value if isinstance(value, str) else json.dumps(value)
 
 
-def _failures(cell: Cell) -> Iterator[str]:
-    failed = [one.record for one in cell.found if one.record["status"] == "failed"]
-    yield from (f"{record['unit']}: {record['reason']}" for record in failed[:FAILURES])
-    if len(failed) > FAILURES:
-        yield f"and {len(failed) - FAILURES} more"
+def _list_failures(experiment: GroupedExperiment) -> Iterator[str]:
+    failed = experiment.failed
+    yield from (f"{record['sample']}: {record['reason']}" for record in failed[:MAX_FAILURES])
+    if len(failed) > MAX_FAILURES:
+        yield f"and {len(failed) - MAX_FAILURES} more"
 
 
-def _beside(cell: Cell, found: Sequence[Tradeoff]) -> Iterator[tuple[str, str]]:
-    """What a server can do with the same defense."""
-    for one in found:
-        for point in one.points:
-            if point.cell is cell:
-                condition = f", {one.condition}" if one.condition else ""
-                yield f"{one.utility.label}{condition}: {number(point.utility.mean)}", point.served.key
+def _list_utilities(experiment: GroupedExperiment, tradeoffs: Sequence[Tradeoff]) -> Iterator[tuple[str, str]]:
+    """Yield the utility of the same defense for a server, and the key of the experiment that measured it."""
+    for tradeoff in tradeoffs:
+        for point in tradeoff.points:
+            if point.attack_experiment is experiment:
+                condition = f", {tradeoff.condition}" if tradeoff.condition else ""
+                text = f"{tradeoff.utility.label}{condition}: {format_number(point.utility.mean)}"
+                yield text, point.utility_experiment.key

@@ -1,4 +1,4 @@
-"""The photographs and reconstructions of a site: written once each, small, under names that nobody else chose."""
+"""The photographs and reconstructions of a site: each is written once, small, under a name made from its content."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from bench.images.photographs import Source
 from bench.runner import directory
 from bench.runner.records import Record
 from leaderboard import run_report
-from leaderboard.comparison import Found
+from leaderboard.comparison import LocatedRecord
 
 FOLDER = "pictures"
 QUALITY = 90  # of WebP
@@ -25,39 +25,40 @@ QUALITY = 90  # of WebP
 
 @dataclass(frozen=True, kw_only=True)
 class Pair:
-    """A reconstruction, and the photograph beside it where there is one; both relative to the page."""
+    """The paths of a reconstruction and of its photograph where there is one, relative to the page."""
 
-    made: str
+    reconstruction: str
     original: str | None
 
 
-def pairs(found: Iterable[Found], out: Path) -> Iterator[tuple[Record, Pair]]:
-    """The records of which there is a reconstruction, with their pictures, which are written into the site `out`."""
-    for one in found:
-        made = _as_it_is(one.folder, directory.reconstruction_path(one.folder, one.record), out)
-        if made is not None:
-            original = _as_it_is(one.folder, run_report.photograph(one.folder, one.record), out) or _builtin(one.record, out)
-            yield one.record, Pair(made=made, original=original)
+def write_pairs(records: Iterable[LocatedRecord], out: Path) -> Iterator[tuple[Record, Pair]]:
+    """Write the images of all reconstructions into the site `out`, and yield their records with the paths."""
+    for located in records:
+        folder, record = located.folder, located.record
+        reconstruction = _copy_picture(folder, directory.reconstruction_path(folder, record), out)
+        if reconstruction is not None:
+            original = _copy_picture(folder, run_report.photograph_path(folder, record), out) or _write_builtin(record, out)
+            yield record, Pair(reconstruction=reconstruction, original=original)
 
 
-def _as_it_is(folder: Path, path: Path, out: Path) -> str | None:
-    """A picture of a folder of results; None if there is none, or a record's names lead out of the folder."""
+def _copy_picture(folder: Path, path: Path, out: Path) -> str | None:
+    """Copy an image of a folder of results. Returns None if there is none, or if a record's names lead out of the folder."""
     if not path.is_file() or not path.resolve().is_relative_to(folder.resolve()):
         return None
-    return _written(path.read_bytes(), lambda: photographs.decode(path)[0], out)
+    return _write_picture(path.read_bytes(), lambda: photographs.decode(path)[0], out)
 
 
-def _builtin(record: Record, out: Path) -> str | None:
-    """A photograph that every installation has, cut out as attacks see it."""
-    sources, content = _all_builtin()
-    if record["dataset"]["hash"] != content or record["unit"] not in sources:
+def _write_builtin(record: Record, out: Path) -> str | None:
+    """Write a built-in photograph, cropped as attacks see it. Returns None if the record is of another photograph."""
+    sources, content = _index_builtin()
+    if record["dataset"]["hash"] != content or record["sample"] not in sources:
         return None
-    path = sources[record["unit"]].path
-    return _written(b"cut out " + path.read_bytes(), lambda: Image.fromarray(photographs.read(path).pixels), out)
+    path = sources[record["sample"]].path
+    return _write_picture(b"cut out " + path.read_bytes(), lambda: Image.fromarray(photographs.read(path).pixels), out)
 
 
-def _written(content: bytes, read: Callable[[], Image.Image], out: Path) -> str | None:
-    """Write a picture as WebP, named by its content, unless that was done before; None if it cannot be read."""
+def _write_picture(content: bytes, read: Callable[[], Image.Image], out: Path) -> str | None:
+    """Write an image as WebP, named by its content, unless it exists. Returns None if it cannot be read."""
     name = f"{FOLDER}/{hashlib.sha256(content).hexdigest()[:24]}.webp"
     if not (out / name).is_file():
         try:
@@ -72,7 +73,7 @@ def _written(content: bytes, read: Callable[[], Image.Image], out: Path) -> str 
 
 
 @functools.cache
-def _all_builtin() -> tuple[dict[str, Source], str]:
-    """By name, and the hash that records know them by."""
-    sources = {source.name: source for source in photographs.builtin()}
+def _index_builtin() -> tuple[dict[str, Source], str]:
+    """Return the built-in photographs by name, and their hash in records."""
+    sources = {source.name: source for source in photographs.list_builtin()}
     return sources, hashing.digest({name: source.content_hash() for name, source in sources.items()})

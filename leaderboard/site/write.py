@@ -1,4 +1,4 @@
-"""Writes tables, plots and the page."""
+"""Writes the tables, the plots and the page of a leaderboard."""
 
 from __future__ import annotations
 
@@ -16,38 +16,34 @@ from typing import TYPE_CHECKING, Any
 from bench.core.environment import DISTRIBUTION
 from bench.core.errors import UserError
 from bench.core.progress import Progress
-from leaderboard import comparison, group_tables, plots, recipe
-from leaderboard.comparison import Board
-from leaderboard.group_tables import Sheet
+from bench.core.table import Table, to_csv, to_latex, to_markdown
+from leaderboard import group_tables, plots, recipe
+from leaderboard.comparison import ComparisonGroup, build_groups, load_records
 from leaderboard.recipe import Lookup
 from leaderboard.reproduce.drawing import save
 from leaderboard.site import experiments
-from leaderboard.site.chart import charts
-from leaderboard.tradeoff import tradeoffs
+from leaderboard.site.chart import build_charts
+from leaderboard.tradeoff import build_tradeoffs
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PAGE = "index.html"
-WRITERS: dict[str, Callable[[Sheet], str]] = {
-    "md": group_tables.to_markdown,
-    "csv": group_tables.to_csv,
-    "tex": group_tables.to_latex,
-}
+WRITERS: dict[str, Callable[[Table], str]] = {"md": to_markdown, "csv": to_csv, "tex": to_latex}
 
 
 @dataclass(frozen=True, kw_only=True)
-class Done:
-    """What was written."""
+class WrittenSite:
+    """The page, and the numbers of groups, experiments and records on it."""
 
     page: Path
-    boards: int
-    cells: int
+    groups: int
+    experiments: int
     records: int
 
 
-def write(results: Path, out: Path) -> Done:
-    """Write the leaderboard of all records below `results` into the folder `out`, over what it wrote there before.
+def write(results: Sequence[Path], out: Path) -> WrittenSite:
+    """Write the leaderboard of all records in `results` (files or folders) into the folder `out`, over what it wrote before.
 
     Raises
     ------
@@ -56,88 +52,91 @@ def write(results: Path, out: Path) -> Done:
     OSError
         if it cannot be written.
     """
-    found = comparison.find(results)
-    made = comparison.boards(found)
+    located = load_records(*results)
+    groups = build_groups(located)
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UserError(f"--out: cannot write {out}: {error.strerror}") from error
-    count = sum(len(board.cells) for board in made)
-    with Progress(f"{len(made)} boards, {count} cells", count) as progress:
-        lookup = functools.cache(recipe.installed)
-        shown = [_board(board, made, out, progress, lookup) for board in made]
+    count = sum(len(group.experiments) for group in groups)
+    with Progress(f"{len(groups)} boards, {count} cells", count) as progress:
+        lookup = functools.cache(recipe.find_plugin)
+        views = [_write_group(group, groups, out, progress, lookup) for group in groups]
     page = out / PAGE
-    page.write_text(_page(shown, len(found)), encoding="utf-8", errors="replace")
-    return Done(page=page, boards=len(made), cells=count, records=len(found))
+    page.write_text(_render_page(views, len(located)), encoding="utf-8", errors="replace")
+    return WrittenSite(page=page, groups=len(groups), experiments=count, records=len(located))
 
 
-def _board(board: Board, every: Sequence[Board], out: Path, progress: Progress, lookup: Lookup) -> dict[str, Any]:
-    """All that the page shows of a board; its tables, plots and pictures are written."""
-    found = tradeoffs(board, every) if board.attacked else []
-    name = _file_name(board)
-    sheet = group_tables.pairs(board)
-    tables = {"pairs": sheet} | ({"ranking": group_tables.ranking(board)} if board.attacked else {})
-    shown = []
-    for row in sheet.rows:
-        shown.append(experiments.view(board, sheet, row, found, out, lookup))
-        progress.advance(note=board.title)
+def _write_group(
+    group: ComparisonGroup, groups: Sequence[ComparisonGroup], out: Path, progress: Progress, lookup: Lookup
+) -> dict[str, Any]:
+    """Write the tables, plots and images of a group, and return what the page shows of it."""
+    tradeoffs = build_tradeoffs(group, groups) if group.has_attacks else []
+    name = _build_file_name(group)
+    table = group_tables.build_pairs_table(group)
+    tables = {"pairs": table} | ({"ranking": group_tables.build_ranking_table(group)} if group.has_attacks else {})
+    views = []
+    for row in table.rows:
+        views.append(experiments.build_view(group, table, row, tradeoffs, out, lookup))
+        progress.advance(note=group.title)
+    figures = plots.draw_plots(group, tradeoffs) if group.has_attacks else ()
     return {
-        "board": board,
-        "sheet": sheet,
-        "columns": experiments.columns(sheet),
-        "cells": shown,
-        "charts": charts(found),
-        "tables": [_tables(table, f"{name}-{kind}", out) for kind, table in tables.items()],
-        "plots": [_plot(name, kind, figure, out) for kind, figure in (plots.plots(board, found) if board.attacked else ())],
+        "group": group,
+        "table": table,
+        "columns": experiments.select_columns(table),
+        "experiments": views,
+        "charts": build_charts(tradeoffs),
+        "tables": [_write_tables(table, f"{name}-{kind}", out) for kind, table in tables.items()],
+        "plots": [_write_plot(name, kind, figure, out) for kind, figure in figures],
     }
 
 
-def _tables(sheet: Sheet, name: str, out: Path) -> dict[str, str]:
+def _write_tables(table: Table, name: str, out: Path) -> dict[str, str]:
     folder = out / "tables"
     folder.mkdir(exist_ok=True)
     for suffix, writer in WRITERS.items():
-        (folder / f"{name}.{suffix}").write_text(writer(sheet), encoding="utf-8", errors="replace")
+        (folder / f"{name}.{suffix}").write_text(writer(table), encoding="utf-8", errors="replace")
     return {suffix: f"tables/{name}.{suffix}" for suffix in WRITERS}
 
 
-def _plot(name: str, kind: str, figure: Figure, out: Path) -> dict[str, Any]:
-    files = {path.suffix[1:]: path.relative_to(out).as_posix() for path in save(figure, out / "plots" / f"{name}-{_plain(kind)}")}
+def _write_plot(name: str, kind: str, figure: Figure, out: Path) -> dict[str, Any]:
+    files = {path.suffix[1:]: path.relative_to(out).as_posix() for path in save(figure, out / "plots" / f"{name}-{_slugify(kind)}")}
     return files | {"name": kind.replace("-", ", "), "interactive": kind.startswith(plots.TRADEOFF)}
 
 
-def _page(shown: Sequence[dict[str, Any]], records: int) -> str:
+def _render_page(groups: Sequence[dict[str, Any]], records: int) -> str:
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     source = files("leaderboard.site") / "page"
     style, script = ((source / file).read_text(encoding="utf-8") for file in ("style.css", "script.js"))
     environment = Environment(
         loader=PackageLoader("leaderboard.site", "page"),
-        autoescape=True,  # every string of a user is text, whatever is in it
+        autoescape=True,  # every string of a user is text
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
     return environment.get_template("index.html.j2").render(
-        boards=shown,
+        groups=groups,
         records=records,
         version=version(DISTRIBUTION),
         style=style,
         script=script,
-        # No other script or style runs, wherever it may have got in.
-        script_hash=_hash(script),
-        style_hash=_hash(style),
+        # No other script or style runs.
+        script_hash=_hash_source(script),
+        style_hash=_hash_source(style),
     )
 
 
-def _hash(text: str) -> str:
-    """As a content security policy names what it allows."""
+def _hash_source(text: str) -> str:
+    """Return the hash of a script or style for the content security policy."""
     return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
 
 
-def _file_name(board: Board) -> str:
-    """Of letters that every system takes, and told apart by the key."""
-    return "-".join([_plain(board.head["task"]), _plain(board.head["dataset"]["name"]), board.key[:8]])
+def _build_file_name(group: ComparisonGroup) -> str:
+    """Return a name of letters that every system accepts, which the key makes unique."""
+    return "-".join([_slugify(group.metadata["task"]), _slugify(group.metadata["dataset"]["name"]), group.key[:8]])
 
 
-def _plain(text: str) -> str:
+def _slugify(text: str) -> str:
     return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")[:30]

@@ -1,4 +1,4 @@
-"""What attacks on subspaces may depend on: the subspace and not its basis; and knowing more never hurts, on average."""
+"""Attacks on subspaces depend on the subspace and not on its basis; more knowledge does not hurt on average."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -6,23 +6,26 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from bench.api import Asset, Attack, DescriptorAttack, Trial
+from bench.api import Attack, DescriptorAttack
 from bench.codebook import dictionary
 from bench.codebook.public import Public
-from bench.core.randomness import randomness
+from bench.core.randomness import derive_generator
 from bench.extractors.sift import Sift
 from bench.images import photographs
 from bench.registry import discovery, spec
-from bench.runner.other_releases import OtherReleases
-from bench.tasks.reconstruction import RELEASES, Reconstruction, view
+from bench.runner.other_releases import ReleasePool
+from bench.settings import Asset
+from bench.task_api import Trial
+from bench.tasks.reconstruction import RELEASES, Reconstruction, build_view
 from bench.testing import NO_SAMPLE, shot
-from bench.types import Features, Floats, Knowledge, Release, Subspaces
+from bench.threat_model import DefenseDatabase, OtherReleases, PublicDatabase, RepeatedReleases
+from bench.types import Features, Floats, Release, Subspaces
 from defenses.affine import Affine
 from defenses.ldp import LDP
 from leaderboard.intervals import interval
 from metrics.angle import Angle
 
-SUB_DATABASES = 4  # fewer and smaller than in earnest, so that few releases of others cover them
+SUB_DATABASES = 4  # fewer and smaller than the defaults, so that few other releases cover them
 KEYPOINTS = 150
 
 
@@ -37,15 +40,15 @@ def database(tmp_path_factory) -> Asset:
 
 @pytest.fixture(scope="module")
 def secret() -> Features:
-    """Some of the astronaut's features."""
-    found = Sift().extract(photographs.read(photographs.builtin()[0].path).pixels)
+    """Some features of the astronaut photograph."""
+    found = Sift().extract(photographs.read(photographs.list_builtin()[0].path).pixels)
     return found.take(np.sort(np.random.default_rng(0).choice(len(found), KEYPOINTS, replace=False)))
 
 
 def trial(attack: Attack, defense: Affine | LDP, secret: Features, others: int | None = None) -> Trial:
     """An attack on one release; `others` limits how many releases of other photographs there are."""
     public = Public()
-    population = OtherReleases(photographs.builtin()[1:4], Sift(max_keypoints=400), defense, public, randomness)
+    population = ReleasePool(photographs.list_builtin()[1:4], Sift(max_keypoints=400), defense, public, derive_generator)
 
     def strangers(count: int) -> Iterator[Release]:
         return population.without("astronaut")(count if others is None else min(count, others))
@@ -66,16 +69,16 @@ def trial(attack: Attack, defense: Affine | LDP, secret: Features, others: int |
 
 def estimate(carried_out: Trial) -> Floats:
     assert isinstance(carried_out.attack, DescriptorAttack)
-    return carried_out.attack.recover(view(carried_out), np.random.default_rng(4))
+    return carried_out.attack.recover(build_view(carried_out), np.random.default_rng(4))
 
 
-def angles(truth: Floats, found: Floats) -> Floats:
-    """Degrees of each keypoint."""
+def measure_angles(truth: Floats, found: Floats) -> Floats:
+    """Return the angle of each keypoint in degrees."""
     return np.array([Angle()(truth[row : row + 1], found[row : row + 1]) for row in range(len(truth))])
 
 
-def rewritten(release: Subspaces, rng: np.random.Generator) -> Subspaces:
-    """The same subspaces by other origins and other orthonormal bases."""
+def reparameterise(release: Subspaces, rng: np.random.Generator) -> Subspaces:
+    """Return the same subspaces with other origins and orthonormal bases."""
     turn = np.linalg.qr(rng.normal(size=(len(release), release.dim, release.dim)))[0]
     bases = turn @ release.bases.astype(np.float64)
     steps = rng.normal(size=(len(release), release.dim))
@@ -83,68 +86,69 @@ def rewritten(release: Subspaces, rng: np.random.Generator) -> Subspaces:
     return dataclasses.replace(release, origins=origins.astype(np.float32), bases=bases.astype(np.float32))
 
 
-def on_subspaces() -> list[type[Attack]]:
+def list_subspace_attacks() -> list[type[Attack]]:
     return [
         attack
-        for attack in discovery.everything(discovery.ATTACK)
+        for attack in discovery.load_plugins(discovery.ATTACK)
         if issubclass(attack, DescriptorAttack) and Subspaces in attack.accepts
     ]
 
 
-@pytest.mark.parametrize("plugin", on_subspaces(), ids=lambda plugin: plugin.name())
-def test_the_basis_that_was_drawn_says_nothing(plugin, database, secret):
+@pytest.mark.parametrize("plugin", list_subspace_attacks(), ids=lambda plugin: plugin.name())
+def test_the_random_basis_has_no_effect(plugin, database, secret):
     defense = Affine(dim=4, database=database, sub_databases=SUB_DATABASES)
     attack = spec.build(plugin, {})
     assert Reconstruction().explain_not_applicable(defense, attack, Sift(), Public()) is None
     first = trial(attack, defense, secret)
     rng = np.random.default_rng(5)
-    repeats = tuple(rewritten(release, rng) for release in first.repeats)
-    second = dataclasses.replace(first.released(rewritten(first.release, rng)), repeats=repeats)
-    apart = angles(estimate(first), estimate(second))
-    assert np.mean(apart < 0.1) > 0.95  # degrees; float32 turns a few close decisions over
-    if not attack.needs & {Knowledge.REPEATED_RELEASES}:
+    repeats = tuple(reparameterise(release, rng) for release in first.repeats)
+    second = dataclasses.replace(first.with_release(reparameterise(first.release, rng)), repeats=repeats)
+    apart = measure_angles(estimate(first), estimate(second))
+    assert np.mean(apart < 0.1) > 0.95  # degrees; float32 changes a few close decisions
+    if not attack.needs & {RepeatedReleases}:
         turned = secret.take(np.roll(np.arange(len(secret)), 1))
-        elsewhere = first.released(defense.protect(turned, Public(), np.random.default_rng(6)))
-        assert np.median(angles(estimate(first), estimate(elsewhere))) > 5  # negative control: other subspaces
+        elsewhere = first.with_release(defense.protect(turned, Public(), np.random.default_rng(6)))
+        assert np.median(measure_angles(estimate(first), estimate(elsewhere))) > 5  # negative control: other subspaces
 
 
-def less(attack: Attack, secret: Features, defense: Affine | LDP) -> tuple[Floats, Floats]:
-    """Angles to the truth with all that the attack may know, and with less of it."""
+def compare_knowledge(attack: Attack, secret: Features, defense: Affine | LDP) -> tuple[Floats, Floats]:
+    """Return angles to the truth with all knowledge of the attack, and with less of it."""
     full = trial(attack, defense, secret)
-    if Knowledge.REPEATED_RELEASES in attack.needs:
+    if RepeatedReleases in attack.needs:
         poor = trial(dataclasses.replace(attack, releases=1), defense, secret)
-    elif Knowledge.OTHER_RELEASES in attack.needs:
+    elif OtherReleases in attack.needs:
         poor = trial(attack, defense, secret, others=0)
     else:
         poor = full
-    seen = view(poor)
+    seen = build_view(poor)
     known = dict(seen.knowledge)
-    for what in attack.needs & {Knowledge.DATABASE, Knowledge.PUBLIC_DATABASE}:
+    for what in attack.needs & {DefenseDatabase, PublicDatabase}:
         whole = known[what]()
-        known[what] = lambda whole=whole: whole.first(len(whole) // 8)
+        fewer = dataclasses.replace(whole, words=whole.words[: len(whole.words) // 8])
+        known[what] = lambda fewer=fewer: fewer
     assert isinstance(poor.attack, DescriptorAttack)
     worse = poor.attack.recover(dataclasses.replace(seen, knowledge=known), np.random.default_rng(4))
-    return angles(secret.descriptors, estimate(full)), angles(secret.descriptors, worse)
+    return measure_angles(secret.descriptors, estimate(full)), measure_angles(secret.descriptors, worse)
 
 
-KNOWING = [
+WITH_KNOWLEDGE = [
     attack
-    for attack in discovery.everything(discovery.ATTACK)
-    if issubclass(attack, DescriptorAttack) and attack.needs & (RELEASES | {Knowledge.DATABASE, Knowledge.PUBLIC_DATABASE})
+    for attack in discovery.load_plugins(discovery.ATTACK)
+    if issubclass(attack, DescriptorAttack) and attack.needs & (RELEASES | {DefenseDatabase, PublicDatabase})
 ]
 
 
-@pytest.mark.parametrize("plugin", KNOWING, ids=lambda plugin: plugin.name())
-def test_nobody_gains_by_knowing_less(plugin, database, secret):
+@pytest.mark.parametrize("plugin", WITH_KNOWLEDGE, ids=lambda plugin: plugin.name())
+def test_less_knowledge_does_not_help(plugin, database, secret):
     attack = spec.build(plugin, {})
-    with_all, with_less = less(attack, secret, Affine(dim=4, database=database, sub_databases=SUB_DATABASES))
+    with_all, with_less = compare_knowledge(attack, secret, Affine(dim=4, database=database, sub_databases=SUB_DATABASES))
     gain = interval(with_all - with_less)  # degrees by which less knowledge is better
-    assert gain.low <= 0, f"{attack.name()} is better without: by {gain}"
+    assert gain.low <= 0, f"{attack.name()} is better with less knowledge, by {gain}"
 
 
-def test_a_gain_by_knowing_less_would_be_noticed(database, secret):
-    """Negative control: with the two turned around the interval does not hold zero."""
-    with_all, with_less = less(
+def test_a_gain_by_less_knowledge_would_be_detected(database, secret):
+    """Negative control: with the two exchanged, the interval does not contain zero."""
+    with_all, with_less = compare_knowledge(
         spec.read("database", discovery.ATTACK), secret, Affine(dim=4, database=database, sub_databases=SUB_DATABASES)
     )
     assert interval(with_less - with_all).low > 0

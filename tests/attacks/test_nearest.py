@@ -4,13 +4,15 @@ import numpy as np
 import pytest
 
 from attacks.nearest import Nearest
-from bench.api import Asset, View
+from bench.api import View
 from bench.codebook import dictionary
 from bench.codebook.public import Public
 from bench.extractors.sift import Sift
 from bench.geometry.nearest_words import unit_rows
-from bench.geometry.subspaces import nearest_to_subspaces
-from bench.types import Features, Knowledge
+from bench.geometry.subspaces import find_nearest_to_subspaces
+from bench.settings import Asset
+from bench.threat_model import PublicDatabase
+from bench.types import Features
 from defenses.affine import Affine
 
 
@@ -21,7 +23,7 @@ def words(rng):
 
 @pytest.fixture
 def release(rng, words, tmp_path):
-    """Lifted through a database of other words."""
+    """Subspaces lifted through a database of other words."""
     private = tmp_path / "W.safetensors"
     dictionary.save(private, rng.integers(0, 200, (640, 128), dtype=np.uint8), {"photographs": []})
     codes = rng.integers(0, 200, (40, 128), dtype=np.uint8)
@@ -35,19 +37,19 @@ def test_returns_words_of_the_public_database(release, words, tmp_path, rng):
         release=release,
         defense=Affine(dim=6),
         extractor=Sift(),
-        knowledge={Knowledge.PUBLIC_DATABASE: lambda: public},
+        knowledge={PublicDatabase: lambda: PublicDatabase(words=public.words)},
     )
     found = Nearest().recover(view, rng)
     assert found.dtype == np.float32
-    assert np.array_equal(found, unit_rows(words)[nearest_to_subspaces(release, words)[0][:, 0]])
+    assert np.array_equal(found, unit_rows(words)[find_nearest_to_subspaces(release, words)[0][:, 0]])
 
 
 def test_in_the_defenses_own_database_it_finds_an_adversary(rng, tmp_path):
-    """Why the attack uses Z: in W the nearest word is one that the defense put there, at distance zero."""
+    """The reason for Z: in W the nearest word is an adversarial one, at distance zero."""
     private = tmp_path / "W.safetensors"
     words = dictionary.save(private, rng.integers(0, 200, (640, 128), dtype=np.uint8), {"photographs": []}).words
     codes = rng.integers(0, 200, (40, 128), dtype=np.uint8)
     secret = Features(keypoints=np.zeros((40, 2), np.float32), descriptors=unit_rows(codes), codes=codes, size=(256, 256))
     release = Affine(dim=6, database=Asset(private)).protect(secret, Public(), rng)
-    _, distance = nearest_to_subspaces(release, words)
+    _, distance = find_nearest_to_subspaces(release, words)
     assert (distance < 1e-5).all()

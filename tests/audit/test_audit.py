@@ -11,33 +11,34 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fakes import install
+from fakes import install_plugins
 from scipy import stats
 
 from bench import cli
-from bench.api import Asset, Defense, Privacy
-from bench.audit.auditor import Audit, audit, near_words
-from bench.audit.bounds import log_ratio, more_alike_than_independent
+from bench.api import Defense, Privacy
+from bench.audit.auditor import Audit, audit, create_features_near_words
+from bench.audit.bounds import is_overdispersed, log_ratio
 from bench.audit.findings import CONFIDENCE
 from bench.codebook.public import Public
 from bench.core.errors import UserError
 from bench.core.exact import Exact
 from bench.geometry.nearest_words import unit_rows
-from bench.mechanisms.subset import draw_distinct, word_subsets
-from bench.types import Descriptors, Features, Indices, WordSets
+from bench.mechanisms.subset import draw_distinct, draw_word_subsets
+from bench.settings import Asset
+from bench.types import Descriptors, Features, Indices, Points, WordSets
 from defenses.ldp import LDP
 from defenses.naive_ldp import NaiveLDP
 
 TRIALS = 20_000
 
 
-def audited(defense: Defense, folder: Path, words: int | None = 64, trials: int = TRIALS, seed: int = 0) -> Audit:
+def run_audit(defense: Defense, folder: Path, words: int | None = 64, trials: int = TRIALS, seed: int = 0) -> Audit:
     return audit(defense, words, trials, seed, folder)
 
 
-def violated_by(found: Audit) -> set[str]:
+def list_violations(found: Audit) -> set[str]:
     """The families that leave no doubt."""
-    return {finding.family for finding in found.findings if finding.certain > found.claimed}
+    return {finding.family for finding in found.findings if finding.certain_epsilon > found.claimed}
 
 
 # ---- the bounds
@@ -62,14 +63,14 @@ def test_the_bound_fails_as_seldom_as_it_says() -> None:
 
 def test_answers_that_are_too_much_alike_are_noticed() -> None:
     rng = np.random.default_rng(0)
-    assert not any(more_alike_than_independent(rng.binomial(500, share, 200), 500) for share in (0.001, 0.1, 0.5, 1.0))
-    assert more_alike_than_independent(500 * rng.binomial(1, 0.1, 200), 500)
-    assert more_alike_than_independent(rng.binomial(500, rng.beta(30, 70, 200)), 500)
+    assert not any(is_overdispersed(rng.binomial(500, share, 200), 500) for share in (0.001, 0.1, 0.5, 1.0))
+    assert is_overdispersed(500 * rng.binomial(1, 0.1, 200), 500)
+    assert is_overdispersed(rng.binomial(500, rng.beta(30, 70, 200)), 500)
     # Of rare events, two may fall into one call; not five hundred.
     rare = [rng.binomial(500, 1e-5, 1000) for _ in range(300)]
     assert any(counts.max() == 2 for counts in rare)
-    assert not any(more_alike_than_independent(counts, 500) for counts in rare)
-    assert more_alike_than_independent(500 * (np.arange(1000) == 7), 500)
+    assert not any(is_overdispersed(counts, 500) for counts in rare)
+    assert is_overdispersed(500 * (np.arange(1000) == 7), 500)
 
 
 # ---- sound defenses
@@ -90,7 +91,7 @@ def test_answers_that_are_too_much_alike_are_noticed() -> None:
     ids=str,
 )
 def test_ldp_keeps_its_promise(defense: LDP, tmp_path: Path) -> None:
-    found = audited(defense, tmp_path)
+    found = run_audit(defense, tmp_path)
     assert found.verdict != "violated"
     assert 0 <= found.strongest.epsilon <= found.claimed
     assert [finding.family for finding in found.findings] == ["membership", "position", "keypoints", "calls"]
@@ -102,14 +103,14 @@ def test_ldp_keeps_its_promise(defense: LDP, tmp_path: Path) -> None:
 
 
 def test_a_bound_near_the_claim_is_called_tight(tmp_path: Path) -> None:
-    found = audited(LDP(epsilon=2.0), tmp_path, trials=50_000)
+    found = run_audit(LDP(epsilon=2.0), tmp_path, trials=50_000)
     assert found.verdict == "tight"
     assert 1.8 < found.strongest.epsilon < 2.0
 
 
 def test_no_cry_of_wolf(tmp_path: Path) -> None:
     """Over many seeds, the bound of 95% errs now and then, the verdict never."""
-    audits = [audited(LDP(epsilon=1.0), tmp_path, words=16, trials=1000, seed=seed) for seed in range(10)]
+    audits = [run_audit(LDP(epsilon=1.0), tmp_path, words=16, trials=1000, seed=seed) for seed in range(10)]
     assert "violated" not in {found.verdict for found in audits}
     bounds = [finding.epsilon for found in audits for finding in found.findings[:2]]
     assert sum(bound > 1.0 for bound in bounds) <= 3
@@ -117,10 +118,10 @@ def test_no_cry_of_wolf(tmp_path: Path) -> None:
 
 
 def test_a_defense_without_a_dictionary(tmp_path: Path) -> None:
-    found = audited(NaiveLDP(epsilon=10.0), tmp_path, words=None, trials=1000)
+    found = run_audit(NaiveLDP(epsilon=10.0), tmp_path, words=None, trials=1000)
     assert found.verdict == "consistent"
     # At ε = 800 of 1024 bits the true pattern is told, and the audit finds which it is.
-    found = audited(NaiveLDP(epsilon=800.0), tmp_path, words=None, trials=1000)
+    found = run_audit(NaiveLDP(epsilon=800.0), tmp_path, words=None, trials=1000)
     assert found.verdict == "consistent"
     assert found.strongest.epsilon > 3
     assert found.strongest.rates[0] > 0.9
@@ -137,28 +138,28 @@ class Laplace(Defense):
     def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> Descriptors:
         noise = rng.laplace(0, self.scale * 2 * 128**0.5 / 4.0, secret.descriptors.shape)
         released = (secret.descriptors + noise).astype(np.float32)
-        return Descriptors(keypoints=secret.keypoints.copy(), size=secret.size, descriptors=released)
+        return Descriptors(positions=Points(keypoints=secret.keypoints.copy()), size=secret.size, descriptors=released)
 
     def privacy(self, public: Public) -> Privacy:
         return Privacy("epsilon-ldp", 4.0)
 
 
 def test_noise_is_judged_by_projections(tmp_path: Path) -> None:
-    sound = audited(Laplace(), tmp_path, words=None, trials=5000)
+    sound = run_audit(Laplace(), tmp_path, words=None, trials=5000)
     assert sound.verdict == "consistent"
     assert "projection" in {finding.family for finding in sound.findings}
-    assert violated_by(audited(Laplace(scale=0.01), tmp_path, words=None, trials=5000)) == {"projection"}
+    assert list_violations(run_audit(Laplace(scale=0.01), tmp_path, words=None, trials=5000)) == {"projection"}
 
 
 # ---- a defense that remembers
 
 
 def test_what_is_remembered_counts_once_a_call(tmp_path: Path) -> None:
-    found = audited(LDP(epsilon=2.0, memoize=True), tmp_path, words=16, trials=4 * TRIALS)
+    found = run_audit(LDP(epsilon=2.0, memoize=True), tmp_path, words=16, trials=4 * TRIALS)
     assert found.verdict in ("consistent", "tight")
     assert [finding.family for finding in found.findings] == ["membership", "position"]
     assert found.strongest.epsilon > 1.5
-    assert all(finding.alike and finding.trials < 2 * TRIALS for finding in found.findings)
+    assert all(finding.overdispersed and finding.trials < 2 * TRIALS for finding in found.findings)
     assert any("linked" in note or "equal answers" in note for note in found.notes)
 
 
@@ -174,7 +175,7 @@ class Secretive(LDP):
 
 
 def test_memory_that_is_not_declared_is_caught(tmp_path: Path) -> None:
-    assert violated_by(audited(Secretive(epsilon=2.0, memoize=True), tmp_path, words=16)) == {"keypoints"}
+    assert list_violations(run_audit(Secretive(epsilon=2.0, memoize=True), tmp_path, words=16)) == {"keypoints"}
 
 
 # ---- wrong defenses
@@ -188,13 +189,13 @@ class Wrong(LDP):
 
     def draw(self, true: Indices, domain: int, rng: np.random.Generator) -> Indices:
         """(N,) -> (N, m)"""
-        return word_subsets(true, domain, self.epsilon, self.subset_size, rng)
+        return draw_word_subsets(true, domain, self.epsilon, self.subset_size, rng)
 
     def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> WordSets:
         known = public.dictionary(self.dictionary)
         words = self.draw(public.nearest_words(self.dictionary, secret), len(known), rng)
         candidates = unit_rows(known.words[words])
-        return WordSets(keypoints=secret.keypoints.copy(), size=secret.size, candidates=candidates, words=words)
+        return WordSets(positions=Points(keypoints=secret.keypoints.copy()), size=secret.size, candidates=candidates, words=words)
 
 
 class TooSmallDomain(Wrong):
@@ -202,7 +203,7 @@ class TooSmallDomain(Wrong):
 
     def draw(self, true: Indices, domain: int, rng: np.random.Generator) -> Indices:
         told = rng.random(len(true)) < 1 / (1 + (domain / 2 - self.subset_size) / self.subset_size * math.exp(-self.epsilon))
-        return drawn(true, told, domain, self.subset_size, rng)
+        return draw_sets(true, told, domain, self.subset_size, rng)
 
 
 class OneTooFew(Wrong):
@@ -210,7 +211,7 @@ class OneTooFew(Wrong):
 
     def draw(self, true: Indices, domain: int, rng: np.random.Generator) -> Indices:
         told = rng.random(len(true)) < 1 / (1 + (domain - 1 - self.subset_size) / self.subset_size * math.exp(-self.epsilon))
-        return drawn(true, told, domain, self.subset_size, rng)
+        return draw_sets(true, told, domain, self.subset_size, rng)
 
 
 class TrueWordFirst(Wrong):
@@ -257,7 +258,7 @@ class SubsetSelectionSorted(SubsetSelectionAsItComes):
         return np.sort(super().draw(true, domain, rng), axis=1)
 
 
-def drawn(true: Indices, told: np.ndarray, domain: int, size: int, rng: np.random.Generator) -> Indices:
+def draw_sets(true: Indices, told: np.ndarray, domain: int, size: int, rng: np.random.Generator) -> Indices:
     """The sets of the mechanism once u is drawn."""
     words = np.empty((len(true), size), dtype=np.int64)
     for u in (0, 1):
@@ -281,19 +282,19 @@ def drawn(true: Indices, told: np.ndarray, domain: int, size: int, rng: np.rando
 )
 def test_a_wrong_defense_is_caught(wrong: type[Wrong], family: str, tmp_path: Path) -> None:
     trials = 2000 if wrong in (OneSeedForEveryKeypoint, SubsetSelectionAsItComes) else TRIALS  # they are slow
-    found = audited(wrong(epsilon=2.0), tmp_path, trials=trials)
+    found = run_audit(wrong(epsilon=2.0), tmp_path, trials=trials)
     assert found.verdict == "violated"
-    assert family in violated_by(found)
+    assert family in list_violations(found)
     if family == "position":
-        assert "membership" not in violated_by(found)  # as sets they are right
+        assert "membership" not in list_violations(found)  # as sets they are right
     if family in ("keypoints", "calls"):
-        assert violated_by(found) <= {family, "membership", "position"}
+        assert list_violations(found) <= {family, "membership", "position"}
 
 
 def test_the_fakes_are_wrong_in_one_way_alone(tmp_path: Path) -> None:
     """The controls: as ldp draws, and as sets, the same code passes."""
-    assert audited(Wrong(epsilon=2.0), tmp_path).verdict != "violated"
-    assert audited(SubsetSelectionSorted(epsilon=2.0), tmp_path, trials=2000).verdict != "violated"
+    assert run_audit(Wrong(epsilon=2.0), tmp_path).verdict != "violated"
+    assert run_audit(SubsetSelectionSorted(epsilon=2.0), tmp_path, trials=2000).verdict != "violated"
 
 
 # ---- enumeration
@@ -301,7 +302,7 @@ def test_the_fakes_are_wrong_in_one_way_alone(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("words", "size", "epsilon"), [(3, 1, 1.0), (4, 2, 2.0), (4, 1, Exact("1/3"))])
 def test_all_outputs_of_ldp_keep_the_ratio_exactly(words: int, size: int, epsilon: float, tmp_path: Path) -> None:
-    found = audited(LDP(epsilon=epsilon, subset_size=size), tmp_path, words=words, trials=2000)
+    found = run_audit(LDP(epsilon=epsilon, subset_size=size), tmp_path, words=words, trials=2000)
     assert found.enumeration is not None
     assert not found.enumeration.exceeds
     assert found.enumeration.low == pytest.approx(epsilon, abs=1e-14) == found.enumeration.high
@@ -310,19 +311,19 @@ def test_all_outputs_of_ldp_keep_the_ratio_exactly(words: int, size: int, epsilo
 
 @pytest.mark.parametrize(("wrong", "words", "size"), [(OneTooFew, 5, 1), (TrueWordFirst, 3, 2), (NearestWord, 5, 1)])
 def test_enumeration_catches_what_trials_cannot(wrong: type[Wrong], words: int, size: int, tmp_path: Path) -> None:
-    found = audited(wrong(epsilon=0.5, subset_size=size), tmp_path, words=words, trials=400)
+    found = run_audit(wrong(epsilon=0.5, subset_size=size), tmp_path, words=words, trials=400)
     assert found.enumeration is not None
     assert found.enumeration.exceeds
     assert found.verdict == "violated"
     if wrong is OneTooFew:
-        assert violated_by(found) == set()
+        assert list_violations(found) == set()
         assert found.enumeration.low == pytest.approx(0.5 + math.log(4 / 3), abs=1e-12)  # |K| − m over |K| − 1 − m
 
 
 @pytest.mark.parametrize("epsilon", [100.0, 1000.0])
 def test_enumeration_at_large_epsilon(epsilon: float, tmp_path: Path) -> None:
     """Probabilities below 2^-60 cannot be told from nothing."""
-    found = audited(LDP(epsilon=epsilon, subset_size=1), tmp_path, words=3, trials=400)
+    found = run_audit(LDP(epsilon=epsilon, subset_size=1), tmp_path, words=3, trials=400)
     assert found.enumeration is not None
     assert 38 < found.enumeration.low < 50
     assert math.isinf(found.enumeration.high)
@@ -330,8 +331,8 @@ def test_enumeration_at_large_epsilon(epsilon: float, tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_enumerated_is_said(tmp_path: Path) -> None:
-    assert any("at most 6 words" in note for note in audited(LDP(), tmp_path, trials=400).notes)
-    remembering = audited(LDP(epsilon=1.0, memoize=True), tmp_path, words=4, trials=400)
+    assert any("at most 6 words" in note for note in run_audit(LDP(), tmp_path, trials=400).notes)
+    remembering = run_audit(LDP(epsilon=1.0, memoize=True), tmp_path, words=4, trials=400)
     assert remembering.enumeration is None
     assert any("answers to all words" in note for note in remembering.notes)
 
@@ -340,14 +341,14 @@ def test_what_cannot_be_enumerated_is_said(tmp_path: Path) -> None:
 
 
 def test_inputs_are_near_words_and_not_on_them(tmp_path: Path) -> None:
-    from bench.codebook.examples import small_dictionary
+    from bench.codebook.examples import write_dictionary
 
-    asset, public = small_dictionary(tmp_path, 64), Public()
-    secrets = near_words(LDP(dictionary=asset), public)
+    asset, public = write_dictionary(tmp_path, 64), Public()
+    secrets = create_features_near_words(LDP(dictionary=asset), public)
     np.testing.assert_array_equal(public.nearest_words(asset, secrets), np.arange(64))
     assert secrets.codes is not None
     assert (secrets.codes != public.dictionary(asset).words).any(axis=1).all()
-    assert len(near_words(LDP(dictionary=asset, words=10), public)) == 10
+    assert len(create_features_near_words(LDP(dictionary=asset, words=10), public)) == 10
 
 
 @pytest.mark.parametrize(
@@ -381,14 +382,14 @@ def test_the_command(capfd: pytest.CaptureFixture[str]) -> None:
 
 
 def test_a_violation_is_exit_status_1(capfd: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    install(tmp_path, monkeypatch, {"feature_privacy.defenses": {"overclaiming": "fake_plugins.overclaiming:PLUGIN"}})
+    install_plugins(tmp_path, monkeypatch, {"feature_privacy.defenses": {"overclaiming": "fake_plugins.overclaiming:PLUGIN"}})
     status, shown, _ = run(capfd, "--defense", "overclaiming", "--words", 16, "--trials", 4000)
     assert status == 1
     assert "violated, beyond doubt of 1e-06 (by membership, position, projection, " in " ".join(shown.split())
 
 
 def test_same_seed_same_audit(tmp_path: Path) -> None:
-    one, again, other = (audited(LDP(epsilon=2.0), tmp_path, trials=1000, seed=seed) for seed in (1, 1, 2))
+    one, again, other = (run_audit(LDP(epsilon=2.0), tmp_path, trials=1000, seed=seed) for seed in (1, 1, 2))
     assert one == again
     assert one != other
     assert Asset(tmp_path / "dictionary-64-1.safetensors").endswith("1.safetensors")

@@ -9,40 +9,40 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bench.audit.exhaustive import Law, NotEnumerableError, greatest_ratio, law
-from bench.mechanisms.subset import chance_digits, word_subsets
+from bench.audit.exhaustive import Law, NotEnumerableError, bound_greatest_ratio, compute_law
+from bench.mechanisms.subset import chance_digits, draw_word_subsets
 
 EDGE = Fraction(1, 2**58)
 
 
 def test_dice() -> None:
-    found = law(lambda rng: int(rng.integers(1, 6, endpoint=True) + rng.integers(1, 7)))
+    found = compute_law(lambda rng: int(rng.integers(1, 6, endpoint=True) + rng.integers(1, 7)))
     expected = Counter(a + b for a in range(1, 7) for b in range(1, 7))
     assert found.chances == {total: Fraction(count, 36) for total, count in expected.items()}
     assert found.left_open == 0
 
 
 def test_arrays_choices_and_permutations() -> None:
-    assert law(lambda rng: tuple(rng.integers(2, size=(2, 2)).ravel().tolist())).chances == dict.fromkeys(
+    assert compute_law(lambda rng: tuple(rng.integers(2, size=(2, 2)).ravel().tolist())).chances == dict.fromkeys(
         itertools.product((0, 1), repeat=4), Fraction(1, 16)
     )
-    assert law(lambda rng: tuple(rng.permutation(4).tolist())).chances == dict.fromkeys(
+    assert compute_law(lambda rng: tuple(rng.permutation(4).tolist())).chances == dict.fromkeys(
         itertools.permutations(range(4)), Fraction(1, 24)
     )
-    pairs = law(lambda rng: tuple(rng.choice(np.array([5, 6, 7]), size=2, replace=False).tolist())).chances
+    pairs = compute_law(lambda rng: tuple(rng.choice(np.array([5, 6, 7]), size=2, replace=False).tolist())).chances
     assert pairs == dict.fromkeys(itertools.permutations((5, 6, 7), 2), Fraction(1, 6))
 
 
 def test_draws_from_many_ranges_at_once() -> None:
-    found = law(lambda rng: tuple(rng.integers(np.array([2, 3])).tolist())).chances
+    found = compute_law(lambda rng: tuple(rng.integers(np.array([2, 3])).tolist())).chances
     assert found == dict.fromkeys(itertools.product(range(2), range(3)), Fraction(1, 6))
-    dice = law(lambda rng: tuple(rng.integers(1, np.array([[2], [2]]), endpoint=True).ravel().tolist())).chances
+    dice = compute_law(lambda rng: tuple(rng.integers(1, np.array([[2], [2]]), endpoint=True).ravel().tolist())).chances
     assert dice == dict.fromkeys(itertools.product((1, 2), repeat=2), Fraction(1, 4))
 
 
 def test_doubles_are_exact() -> None:
     """0.3 is no multiple of 2^-53, and rng.random() < 0.3 has a probability that is."""
-    found = law(lambda rng: bool(rng.random() < 0.3))
+    found = compute_law(lambda rng: bool(rng.random() < 0.3))
     assert found.left_open == 0
     assert found.chances[True] == Fraction(math.ceil(Fraction(0.3) * 2**53), 2**53)
     assert sum(found.chances.values()) == 1
@@ -53,7 +53,7 @@ def test_several_thresholds_and_what_follows_them() -> None:
         x = rng.random()
         return "low" if x < 0.25 else int(rng.integers(3)) if x < 0.75 else "high"
 
-    assert law(mechanism).chances == {
+    assert compute_law(mechanism).chances == {
         "low": Fraction(1, 4),
         "high": Fraction(1, 4),
         **dict.fromkeys(range(3), Fraction(1, 6)),
@@ -65,7 +65,9 @@ def test_the_sampler_has_the_law_of_the_theorem(domain: int, size: int, epsilon:
     """Drawn word by word, or without repetition: to within 2^-58, as the digits of p are."""
     p = Fraction(chance_digits(epsilon, domain, size, 128), 2**128)
     for true in range(domain):
-        found = law(lambda rng, true=true: tuple(word_subsets(np.array([true]), domain, epsilon, size, rng)[0].tolist()))
+        found = compute_law(
+            lambda rng, true=true: tuple(draw_word_subsets(np.array([true]), domain, epsilon, size, rng)[0].tolist())
+        )
         assert found.left_open < EDGE
         for Z in itertools.combinations(range(domain), size):
             expected = p / math.comb(domain - 1, size - 1) if true in Z else (1 - p) / math.comb(domain - 1, size)
@@ -75,11 +77,11 @@ def test_the_sampler_has_the_law_of_the_theorem(domain: int, size: int, epsilon:
 
 def test_greatest_ratio() -> None:
     laws = [Law({"a": Fraction(1, 2), "b": Fraction(1, 2)}), Law({"a": Fraction(1, 8), "b": Fraction(7, 8)})]
-    assert greatest_ratio(laws) == (4, 4)
+    assert bound_greatest_ratio(laws) == (4, 4)
     open_laws = [Law({"a": Fraction(3, 4)}, Fraction(1, 4)), Law({"a": Fraction(1, 2), "b": Fraction(1, 2)})]
-    assert greatest_ratio(open_laws) == (2, None)  # b has at most 1/4 under the first, and perhaps nothing
+    assert bound_greatest_ratio(open_laws) == (2, None)  # b has at most 1/4 under the first, and perhaps nothing
     certain = [Law({"a": Fraction(1)}), Law({"b": Fraction(1)})]
-    assert greatest_ratio(certain) == (None, None)
+    assert bound_greatest_ratio(certain) == (None, None)
 
 
 @pytest.mark.parametrize(
@@ -98,7 +100,7 @@ def test_greatest_ratio() -> None:
 )
 def test_what_cannot_be_enumerated_is_not(mechanism: Any, reason: str) -> None:
     with pytest.raises(NotEnumerableError, match=reason):
-        law(mechanism, 5000)
+        compute_law(mechanism, 5000)
 
 
 def test_a_function_that_catches_everything_is_played_to_its_end() -> None:
@@ -108,4 +110,4 @@ def test_a_function_that_catches_everything_is_played_to_its_end() -> None:
         except Exception:
             return -1
 
-    assert law(careless).chances == dict.fromkeys(range(4), Fraction(1, 4))
+    assert compute_law(careless).chances == dict.fromkeys(range(4), Fraction(1, 4))

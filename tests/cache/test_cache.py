@@ -14,23 +14,23 @@ import numpy as np
 import pytest
 from fake_plugins.guess import Guess
 from fake_plugins.painter import Painter
-from fakes import FAKES, album, install
+from fakes import FAKES, install_plugins, prepare_plan, write_album
 
 from attacks.sparsity import Sparsity
 from bench import cli
-from bench.api import Asset
 from bench.cache import attack_cache, provenance, store
-from bench.codebook.examples import small_dictionary
+from bench.codebook.examples import write_dictionary
 from bench.codebook.public import ASSETS
 from bench.extractors.sift import Sift
 from bench.formats import tensor_file
 from bench.geometry.nearest_words import WordIndex
-from bench.images.photographs import folder
+from bench.images.photographs import list_photographs
 from bench.inversion import network_cache as networks
 from bench.inversion import weights
 from bench.inversion.plan import Plan, Training
-from bench.runner import plan as runner
+from bench.runner import execute
 from bench.runner.records import Record
+from bench.settings import Asset
 from bench.tasks.reconstruction import Reconstruction
 from defenses.affine import Affine
 from defenses.ldp import LDP
@@ -41,7 +41,7 @@ PAINT = Reconstruction(inverter="painter")
 
 @pytest.fixture(autouse=True)
 def kept_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    install(tmp_path / "installed", monkeypatch, FAKES)
+    install_plugins(tmp_path / "installed", monkeypatch, FAKES)
     monkeypatch.setenv(store.VARIABLE, str(tmp_path / "cache"))
     monkeypatch.setattr(attack_cache, "WORTH", 0.0)
     return tmp_path / "cache"
@@ -49,12 +49,12 @@ def kept_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def images(tmp_path: Path) -> Path:
-    return album(tmp_path / "album")
+    return write_album(tmp_path / "album")
 
 
 @pytest.fixture
 def small(tmp_path: Path) -> Asset:
-    return small_dictionary(tmp_path)
+    return write_dictionary(tmp_path)
 
 
 @pytest.fixture
@@ -77,7 +77,7 @@ def numbers() -> store.Content:
 
 
 def run(defense: Any, attack: Any, images: Any, task: Reconstruction = PAINT, **more: Any) -> list[Record]:
-    return runner.run([defense], [attack], images, task=task, **more)
+    return execute.run([defense], [attack], images, task=task, **more)
 
 
 def judged(records: list[Record]) -> list[Any]:
@@ -136,7 +136,7 @@ def test_whatever_an_attack_sees_makes_another_key(images: Path, tmp_path: Path,
         run(*arguments, **more)
         return len(guessed) - before
 
-    one, other = (small_dictionary(tmp_path, seed=seed) for seed in (1, 2))
+    one, other = (write_dictionary(tmp_path, seed=seed) for seed in (1, 2))
     defense = LDP(epsilon=8, dictionary=one)
     assert calls(defense, Guess(), images) == 2
     assert calls(defense, Guess(), images) == 0
@@ -165,13 +165,13 @@ def test_seconds_are_those_of_the_attack_though_it_was_spared(
 def test_what_was_quick_is_not_kept(images: Path, small: Asset, kept_in: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(attack_cache, "WORTH", np.inf)
     run(LDP(dictionary=small), Guess(), images)
-    assert {entry.kind for entry in store.entries()} == {"words"}
+    assert {entry.kind for entry in store.list_entries()} == {"words"}
 
 
 def test_what_is_kept_is_what_is_used(images: Path, small: Asset) -> None:
     """A control: were something else kept, records would show it."""
     first = run(LDP(dictionary=small), Guess(), images)
-    for entry in store.entries():
+    for entry in store.list_entries():
         if entry.kind == "recovered":
             overwrite_with_one_direction(entry.path)
     assert run(LDP(dictionary=small), Guess(), images)[0]["metrics"]["angle"] != first[0]["metrics"]["angle"]
@@ -189,16 +189,16 @@ def overwrite_with_one_direction(file: Path) -> None:
 
 def test_words_are_searched_once_for_all_settings(images: Path, small: Asset, monkeypatch: pytest.MonkeyPatch) -> None:
     searched: list[int] = []
-    nearest = WordIndex.nearest
+    nearest = WordIndex.find_nearest
 
     def counted(self: WordIndex, rows: Any) -> Any:
         searched.append(len(rows))
         return nearest(self, rows)
 
-    monkeypatch.setattr(WordIndex, "nearest", counted)
+    monkeypatch.setattr(WordIndex, "find_nearest", counted)
     first = [run(LDP(epsilon=epsilon, dictionary=small), Painter(), images) for epsilon in (4, 8)]
     assert len(searched) == 3  # two photographs, and the keypoint of the rehearsal
-    with store.within(store.root() / "elsewhere"):
+    with store.use_folder(store.cache_folder() / "elsewhere"):
         again = [run(LDP(epsilon=epsilon, dictionary=small), Painter(), images) for epsilon in (4, 8)]
     assert len(searched) == 6
     assert list(map(judged, first)) == list(map(judged, again))
@@ -210,32 +210,32 @@ def test_protecting_for_real_leaves_no_trace(images: Path, small: Asset) -> None
 
     features = Sift().extract(photographs.read(images / "0.png").pixels)
     protect(features, LDP(dictionary=small))
-    assert not list(store.entries())
+    assert not list(store.list_entries())
 
 
 def test_network_is_found_again_by_what_made_it(images: Path, tmp_path: Path) -> None:
     plan = Plan(
         defense=Undefended(),
-        served={},
-        photographs=folder(images)[:1],
-        validation=folder(images)[1:],
+        supported_settings={},
+        photographs=list_photographs(images)[:1],
+        validation=list_photographs(images)[1:],
         extractor=Sift(),
         widths=(8, 8),
         training=Training(steps=1),
     )
-    key = networks.key(plan)
+    key = networks.build_key(plan)
     out = tmp_path / "W.safetensors"
     assert networks.fetch(key, out) is None
     shipped = sorted(ASSETS.glob("inversion-*.safetensors"))
     if not shipped:
         pytest.skip("the networks are not here")
-    networks.keep(key, shipped[0])
+    networks.save(key, shipped[0])
     assert networks.fetch(key, out) == weights.load(shipped[0]).meta
     assert out.read_bytes() == shipped[0].read_bytes()
     assert networks.fetch(key, out) is None  # what is there is not overwritten
-    others: dict[str, Any] = {"training": Training(steps=2), "widths": (8, 9), "photographs": folder(images)[1:]}
+    others: dict[str, Any] = {"training": Training(steps=2), "widths": (8, 9), "photographs": list_photographs(images)[1:]}
     for field, value in {**others, "defense": Affine()}.items():
-        assert networks.key(dataclasses.replace(plan, **{field: value})) != key
+        assert networks.build_key(dataclasses.replace(plan, **{field: value})) != key
 
 
 # ---- source
@@ -257,9 +257,9 @@ def test_source_is_that_of_all_that_is_imported_and_no_more(tmp_path: Path, monk
     package(tmp_path / "strange", "def f():\n    from strange import deep\n")
 
     def digest() -> str:
-        provenance.source.cache_clear()
+        provenance.hash_modules.cache_clear()
         provenance._text.cache_clear()
-        return provenance.source("strange.attack")
+        return provenance.hash_modules("strange.attack")
 
     first = digest()
     for file in ("metric.py", "types.py"):  # not imported, or for types alone
@@ -280,10 +280,10 @@ def test_source_of_an_attack_has_its_kernels_and_no_metric_or_command() -> None:
         found.append(module)
         return kept_text(module)
 
-    provenance.source.cache_clear()
+    provenance.hash_modules.cache_clear()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(provenance, "_text", listed)
-        provenance.source("attacks.clustering")
+        provenance.hash_modules("attacks.clustering")
     assert {"bench.geometry.shared_sub_database", "bench.geometry.subspaces", "bench.types"} <= set(found)
     assert not [name for name in found if name.startswith(("metrics", "bench.cli", "leaderboard", "bench.runner.plan"))]
 
@@ -293,15 +293,15 @@ def test_source_of_an_attack_has_its_kernels_and_no_metric_or_command() -> None:
 
 def test_damaged_entries_are_named_and_made_again(kept_in: Path, caplog: pytest.LogCaptureFixture) -> None:
     first, _ = store.fetch("a", 1, numbers)
-    (entry,) = store.entries()
-    assert entry.fault() is None
+    (entry,) = store.list_entries()
+    assert entry.find_fault() is None
     entry.path.write_bytes(entry.path.read_bytes()[:-1] + b"\x07")
-    assert "checksum" in str(entry.fault())
+    assert "checksum" in str(entry.find_fault())
     again, _ = store.fetch("a", 1, numbers)
     np.testing.assert_array_equal(again["numbers"], first["numbers"])
     assert "checksum" in caplog.text
     assert "made again" in caplog.text
-    assert entry.fault() is None
+    assert entry.find_fault() is None
 
 
 def test_folders_are_kept_with_checksums(kept_in: Path) -> None:
@@ -312,15 +312,15 @@ def test_folders_are_kept_with_checksums(kept_in: Path) -> None:
         (place / "a.txt").write_text("a")
         (place / "b.txt").write_text("b")
 
-    place = store.folder("models", "key", fill)
-    assert store.folder("models", "key", fill) == place
+    place = store.fetch_folder("models", "key", fill)
+    assert store.fetch_folder("models", "key", fill) == place
     assert len(made) == 1
     told = subprocess.run(["sha256sum", "-c", store.SUMS], cwd=place, capture_output=True, text=True, check=True).stdout
     assert told == "a.txt: OK\nb.txt: OK\n"
     (place / "b.txt").write_text("c")
-    (entry,) = store.entries()
-    assert "checksum of b.txt" in str(entry.fault())
-    assert (store.folder("models", "key", fill) / "b.txt").read_text() == "b"
+    (entry,) = store.list_entries()
+    assert "checksum of b.txt" in str(entry.find_fault())
+    assert (store.fetch_folder("models", "key", fill) / "b.txt").read_text() == "b"
     assert len(made) == 2
 
     def broken(place: Path) -> None:
@@ -328,8 +328,8 @@ def test_folders_are_kept_with_checksums(kept_in: Path) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        store.folder("models", "other", broken)
-    assert [entry.path for entry in store.entries()] == [place]
+        store.fetch_folder("models", "other", broken)
+    assert [entry.path for entry in store.list_entries()] == [place]
 
 
 def test_full_disk_keeps_nothing_and_loses_nothing(kept_in: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -338,15 +338,15 @@ def test_full_disk_keeps_nothing_and_loses_nothing(kept_in: Path, caplog: pytest
         arrays, _ = store.fetch("a", "full", numbers)
     np.testing.assert_array_equal(arrays["numbers"], np.arange(1000))
     assert "it is not kept" in caplog.text
-    (entry,) = store.entries()  # nothing half-written is left
-    assert entry.fault() is None
+    (entry,) = store.list_entries()  # nothing half-written is left
+    assert entry.find_fault() is None
 
 
 def test_disk_that_fills_up_in_a_run_is_told_and_nothing_else_is_lost(images: Path, tmp_path: Path) -> None:
-    plan = runner.prepare([Undefended()], [Painter()], images, task=PAINT)
+    plan = prepare_plan([Undefended()], [Painter()], images, task=PAINT)
     with small_disk(2000), pytest.raises(OSError, match="large"):  # a picture is larger
-        list(runner.execute([plan], tmp_path / "out"))
-    records = list(runner.execute([plan], tmp_path / "out"))
+        list(execute.execute([plan], tmp_path / "out"))
+    records = list(execute.execute([plan], tmp_path / "out"))
     assert [record["status"] for record in records] == ["ok", "ok"]
     assert len((tmp_path / "out" / "records.jsonl").read_text().splitlines()) == 2
 
@@ -361,8 +361,8 @@ def three(kept_in: Path) -> dict[str, Path]:
     store.fetch("a", "old", numbers)
     store.fetch("b", "large", lambda: ({"numbers": np.arange(10_000)}, {}))
     ago = time.time() - 40 * 24 * 3600
-    os.utime(store.path("a", "old"), (ago, ago))
-    return {"new": store.path("a", "new"), "old": store.path("a", "old"), "large": store.path("b", "large")}
+    os.utime(store.entry_path("a", "old"), (ago, ago))
+    return {"new": store.entry_path("a", "new"), "old": store.entry_path("a", "old"), "large": store.entry_path("b", "large")}
 
 
 def test_list_and_verify(three: dict[str, Path], capfd: pytest.CaptureFixture[str]) -> None:

@@ -1,4 +1,4 @@
-"""The command line, as scripts rely on it."""
+"""The command line: output, exit status and files, as scripts rely on them."""
 
 import json
 import os
@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 from fake_plugins.painter import Painter
-from fakes import FAKES, album, install
+from fakes import FAKES, install_plugins, write_album
 
 from bench import cli
 from bench.api import View
 from bench.cli import terminal
-from bench.codebook.examples import small_dictionary
+from bench.codebook.examples import write_dictionary
 from bench.datasets import colmap
 from bench.datasets.gallery import Gallery
 from bench.registry import discovery
@@ -29,8 +29,8 @@ PAINT = ("--task", "reconstruction:inverter=painter")
 
 @pytest.fixture
 def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Bench:
-    """Run `bench` in an empty folder with made-up plugins; returns the exit status, stdout and stderr."""
-    install(tmp_path / "installed", monkeypatch, FAKES)
+    """Run `bench` in an empty folder with fake plugins. Returns the exit status, stdout and stderr."""
+    install_plugins(tmp_path / "installed", monkeypatch, FAKES)
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
 
@@ -44,21 +44,21 @@ def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.Capture
 
 @pytest.fixture
 def images(tmp_path: Path) -> Path:
-    return album(tmp_path / "album")
+    return write_album(tmp_path / "album")
 
 
 def test_run_writes_everything_and_prints_the_table(bench: Bench, images: Path, tmp_path: Path) -> None:
-    ldp = f"ldp:epsilon=12,dictionary={small_dictionary(tmp_path)}"
+    ldp = f"ldp:epsilon=12,dictionary={write_dictionary(tmp_path)}"
     out = tmp_path / "x"
     defenses, attacks = ("--defense", ldp, "--defense", "none"), ("--attack", "painter", "--attack", "guess")
     command = ("run", *defenses, *attacks, "--images", images, "--out", out, *PAINT)
-    status, shown, told = bench(*command)
+    status, shown, err = bench(*command)
     assert status == 0
     assert "ldp:epsilon=12,subset_size=2" in shown
     assert "n/a" in shown
     assert "guess attacks WordSets or Subspaces" in shown
-    assert f"written to {out}" in told
-    assert "\x1b" not in shown + told
+    assert f"written to {out}" in err
+    assert "\x1b" not in shown + err
     assert {path.name for path in out.iterdir()} == {
         "plan.json",
         "records.jsonl",
@@ -88,15 +88,15 @@ def test_json_prints_the_records(bench: Bench, images: Path) -> None:
     status, shown, _ = bench("run", "--defense", "none", "--attack", "painter", "--images", images, "--json", "--out", "x")
     assert status == 0
     printed = [json.loads(line) for line in shown.splitlines()]
-    assert [record["unit"] for record in printed] == ["0.png", "1.png"]
+    assert [record["sample"] for record in printed] == ["0.png", "1.png"]
     assert shown == Path("x/records.jsonl").read_text()
 
 
-def test_failed_photograph_is_status_1_and_the_others_are_done(bench: Bench, images: Path) -> None:
+def test_failed_photograph_gives_status_1_and_the_others_are_written(bench: Bench, images: Path) -> None:
     (images / "bad.jpg").write_bytes(b"no photograph")
-    status, shown, told = bench("run", "--defense", "none", "--attack", "painter", "--images", images, "--out", "x")
+    status, shown, err = bench("run", "--defense", "none", "--attack", "painter", "--images", images, "--out", "x")
     assert status == 1
-    assert "failed: bad.jpg, none: bad.jpg: cannot be read as an image" in told
+    assert "failed: bad.jpg, none: bad.jpg: cannot be read as an image" in err
     assert "bad.jpg" in shown
     assert len(list(Path("x/figures").iterdir())) == 2
 
@@ -107,14 +107,14 @@ RUN = ("run", "--defense", "none", "--attack", "painter")
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        ((), "say what to do"),
+        ((), "give a command"),
         (("rnu",), "unknown command 'rnu'; did you mean 'run'?"),
         (("run", "--defence", "ldp"), "unknown option '--defence'; did you mean '--defense'?"),
         (("run", "--defence=ldp"), "unknown option '--defence'; did you mean '--defense'?"),
         (("run", "--attack", "painter"), "--defense is missing"),
         (("run", "--defense", "none"), "--attack is missing"),
         (("run", "--defense"), "--defense: expected one argument"),
-        ((*RUN, "more"), "'more' is one argument too many"),
+        ((*RUN, "more"), "'more' is an unexpected argument"),
         ((*RUN, "--seed", "x"), "--seed: expected a whole number, not 'x'"),
         ((*RUN, "--task", "reconstuction"), "unknown task 'reconstuction'; did you mean 'reconstruction'?"),
         ((*RUN, "--extractor", "sitf"), "unknown extractor 'sitf'; did you mean 'sift'?"),
@@ -136,40 +136,42 @@ RUN = ("run", "--defense", "none", "--attack", "painter")
         (("train", "--defense", "ldp", "--images", "absent", "--out", "w"), "no such folder"),
     ],
 )
-def test_mistakes_are_one_line_status_2_and_nothing_written(bench: Bench, arguments: tuple[str, ...], complaint: str) -> None:
-    status, shown, told = bench(*arguments)
+def test_invalid_arguments_give_one_line_and_status_2_and_write_nothing(
+    bench: Bench, arguments: tuple[str, ...], complaint: str
+) -> None:
+    status, shown, err = bench(*arguments)
     assert (status, shown) == (2, "")
-    assert complaint in told
-    assert told.count("\n") == 1
-    assert told.startswith("bench: ")
+    assert complaint in err
+    assert err.count("\n") == 1
+    assert err.startswith("bench: ")
     assert not list(Path().iterdir())
 
 
-def test_empty_folder_and_folder_that_cannot_be_written(bench: Bench, images: Path, tmp_path: Path) -> None:
+def test_empty_folder_and_unwritable_folder(bench: Bench, images: Path, tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     assert bench(*RUN, "--images", tmp_path / "empty")[0] == 2
-    status, _, told = bench(*RUN, "--images", images, "--out", images / "0.png")
+    status, _, err = bench(*RUN, "--images", images, "--out", images / "0.png")
     assert status == 2
-    assert "cannot write" in told
+    assert "cannot write" in err
 
 
 def test_interrupt_keeps_the_records(bench: Bench, images: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[View] = []
-    kept = Painter.reconstruct
+    views: list[View] = []
+    reconstruct = Painter.reconstruct
 
-    def interrupted(self: Any, view: View, rng: np.random.Generator) -> Any:
-        asked.append(view)
-        if len(asked) == 2:
+    def interrupt(self: Any, view: View, rng: np.random.Generator) -> Any:
+        views.append(view)
+        if len(views) == 2:
             raise KeyboardInterrupt
-        return kept(self, view, rng)
+        return reconstruct(self, view, rng)
 
-    monkeypatch.setattr(Painter, "reconstruct", interrupted)
-    status, _, told = bench(*RUN, "--images", images, "--out", "x")
+    monkeypatch.setattr(Painter, "reconstruct", interrupt)
+    status, _, err = bench(*RUN, "--images", images, "--out", "x")
     assert status == 130
-    assert "run the same command again to go on" in told
+    assert "run the same command again to go on" in err
     assert len(Path("x/records.jsonl").read_text().splitlines()) == 1
     assert bench(*RUN, "--images", images, "--out", "x")[0] == 0
-    assert len(asked) == 3  # the first photograph was not done again
+    assert len(views) == 3  # the first photograph is not computed again
 
 
 @pytest.mark.parametrize(
@@ -178,18 +180,18 @@ def test_interrupt_keeps_the_records(bench: Bench, images: Path, monkeypatch: py
 def test_full_disk_and_memory(
     bench: Bench, images: Path, monkeypatch: pytest.MonkeyPatch, error: Exception, complaint: str
 ) -> None:
-    def full(self: Log, record: Any) -> None:
+    def fail(self: Log, record: Any) -> None:
         raise error
 
-    monkeypatch.setattr(Log, "append", full)
-    status, _, told = bench(*RUN, "--images", images, "--out", "x")
+    monkeypatch.setattr(Log, "append", fail)
+    status, _, err = bench(*RUN, "--images", images, "--out", "x")
     assert status == 1
-    assert complaint in told
-    assert "run the same command again" in told
-    assert "Traceback" not in told
+    assert complaint in err
+    assert "run the same command again" in err
+    assert "Traceback" not in err
 
 
-def test_list_shows_plugins_fields_and_what_applies(bench: Bench) -> None:
+def test_list_shows_plugins_fields_and_the_matrix(bench: Bench) -> None:
     status, shown, _ = bench("list")
     assert status == 0
     for word in (
@@ -228,19 +230,19 @@ def test_closed_pipe_is_no_error() -> None:
     assert "BrokenPipe" not in ended.stderr
 
 
-def test_main_job_on_one_photograph(bench: Bench, images: Path) -> None:
-    """The real plugins, where this checkout has the networks that they need."""
-    status, shown, told = bench(
+def test_shipped_networks_on_one_photograph(bench: Bench, images: Path) -> None:
+    """Runs the real plugins if this checkout has their networks."""
+    status, shown, err = bench(
         "run", "--defense", "ldp", "--defense", "none", "--attack", "dia", "--images", images, "--out", "x"
     )
-    if "no adapted attacker" in told:
+    if "no adapted attacker" in err:
         pytest.skip("the networks are not here")
     assert status == 0
     assert "ldp:epsilon=10,subset_size=2" in shown
-    assert discovery.lookup(discovery.ATTACK, "dia").name() in shown
+    assert discovery.load_plugin(discovery.ATTACK, "dia").name() in shown
 
 
-def test_nothing_is_asked_of_the_terminal_when_there_is_none(tmp_path: Path) -> None:
+def test_works_without_a_terminal(tmp_path: Path) -> None:
     environment = {key: value for key, value in os.environ.items() if key not in ("TERM", "COLUMNS")}
     ended = subprocess.run(
         [sys.executable, "-m", "bench.cli", "--version"], capture_output=True, env=environment, cwd=tmp_path, check=True
@@ -275,33 +277,47 @@ def test_dataset_is_written_in_a_layout(bench: Bench) -> None:
         (("colmap:path=a", "--views", "2", "--layout", "colmap", "--out", "x"), "unknown field of colmap 'views'"),
         (
             ("gallery:width=64,height=48,detail=0.1", "--views", "1", "--layout", "colmp", "--out", "x"),
-            "--layout colmp: there is",
+            "--layout colmp: unknown layout; available: aachen, colmap",
         ),
     ],
 )
-def test_mistakes_about_datasets(bench: Bench, arguments: tuple[str, ...], complaint: str) -> None:
-    status, shown, told = bench("dataset", *arguments)
+def test_invalid_arguments_of_dataset(bench: Bench, arguments: tuple[str, ...], complaint: str) -> None:
+    status, shown, err = bench("dataset", *arguments)
     assert status == 2
     assert shown == ""
-    assert complaint in told
+    assert complaint in err
     assert not Path("x").exists()
 
 
-def test_leaderboard_of_what_was_run(bench: Bench, images: Path, tmp_path: Path) -> None:
-    ldp = f"ldp:epsilon=12,dictionary={small_dictionary(tmp_path)}"
+def test_leaderboard_of_two_runs(bench: Bench, images: Path, tmp_path: Path) -> None:
+    ldp = f"ldp:epsilon=12,dictionary={write_dictionary(tmp_path)}"
     for name, defense in (("one", "none"), ("two", ldp)):
         assert bench("run", "--defense", defense, "--attack", "painter", "--images", images, "--out", f"runs/{name}")[0] == 0
-    status, shown, told = bench("leaderboard", "--results", "runs", "--out", "site")
+    status, shown, err = bench("leaderboard", "--results", "runs", "--out", "site")
     assert (status, shown) == (0, "")
-    assert told.splitlines()[-1] == "bench: written to site/index.html (boards: 1, cells: 2, records: 4)"
+    assert err.splitlines()[-1] == "bench: written to site/index.html (comparison groups: 1, experiments: 2, records: 4)"
     written = {path.parent.name for path in Path("site").rglob("*") if path.is_file()}
     assert written == {"site", "tables", "plots", "pictures"}
-    assert len(list(Path("site/pictures").iterdir())) == 2 + 4  # photographs once each, and what was made of them
+    assert len(list(Path("site/pictures").iterdir())) == 2 + 4  # photographs once each, and the reconstructions
     page = Path("site/index.html").read_text()
     assert "no adapted attacker was run (dia)" in page
     assert "bench run --defense none --attack painter --images album --seed 0" in page
     for link in re.findall(r'(?:href|src|data-made|data-original)="([^"#:]+)"', page):
         assert (Path("site") / link).is_file()
+
+
+def test_leaderboard_of_several_results(bench: Bench, images: Path) -> None:
+    for seed in (0, 1, 2):
+        assert bench(*RUN, "--images", images, "--seed", seed, "--out", f"runs/{seed}")[0] == 0
+    results = ("--results", "runs/0", "runs/1", "--results", "runs/2/records.jsonl")
+    status, shown, err = bench("leaderboard", *results, "--out", "site")
+    assert (status, shown) == (0, "")
+    assert "records: 6)" in err
+    Path("empty").mkdir()
+    status, _, err = bench("leaderboard", "--results", "runs/0", "empty", "--out", "x")
+    assert status == 2
+    assert "--results empty: there is no record in it" in err
+    assert not Path("x").exists()
 
 
 @pytest.mark.parametrize(
@@ -314,22 +330,22 @@ def test_leaderboard_of_what_was_run(bench: Bench, images: Path, tmp_path: Path)
         (("--result", ".", "--out", "x"), "unknown option '--result'; did you mean '--results'?"),
     ],
 )
-def test_mistakes_about_leaderboards(bench: Bench, arguments: tuple[str, ...], complaint: str) -> None:
-    status, shown, told = bench("leaderboard", *arguments)
+def test_invalid_arguments_of_leaderboard(bench: Bench, arguments: tuple[str, ...], complaint: str) -> None:
+    status, shown, err = bench("leaderboard", *arguments)
     assert (status, shown) == (2, "")
-    assert complaint in told
-    assert told.count("\n") == 1
+    assert complaint in err
+    assert err.count("\n") == 1
     assert not Path("x").exists()
 
 
-def test_leaderboard_writes_into_a_folder_alone(bench: Bench, images: Path) -> None:
+def test_leaderboard_needs_a_folder_and_undamaged_records(bench: Bench, images: Path) -> None:
     assert bench(*RUN, "--images", images, "--out", "runs")[0] == 0
-    status, _, told = bench("leaderboard", "--results", "runs", "--out", images / "0.png")
+    status, _, err = bench("leaderboard", "--results", "runs", "--out", images / "0.png")
     assert status == 2
-    assert "cannot write" in told
+    assert "cannot write" in err
     with Path("runs/records.jsonl").open("a") as file:
         file.write("damaged\n")
-    status, _, told = bench("leaderboard", "--results", "runs", "--out", "x")
+    status, _, err = bench("leaderboard", "--results", "runs", "--out", "x")
     assert status == 2
-    assert "line 3: no JSON" in told
+    assert "line 3: no JSON" in err
     assert not Path("x").exists()

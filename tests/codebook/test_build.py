@@ -17,7 +17,7 @@ from bench.images import photographs
 def album(tmp_path_factory):
     """Three of the built-in photographs, as a user's folder."""
     folder = tmp_path_factory.mktemp("album")
-    for source in photographs.builtin()[:3]:
+    for source in photographs.list_builtin()[:3]:
         (folder / source.path.name).write_bytes(source.path.read_bytes())
     return folder
 

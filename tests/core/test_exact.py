@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bench.core.exact import Exact, exact
+from bench.core.exact import Exact, to_fraction
 
 
 @pytest.mark.parametrize(
@@ -25,7 +25,7 @@ from bench.core.exact import Exact, exact
 )
 def test_text_is_kept_exactly(text: str, fraction: Fraction, written: str) -> None:
     number = Exact(text)
-    assert number.fraction == fraction == exact(number)
+    assert number.fraction == fraction == to_fraction(number)
     assert number == float(fraction)
     assert str(number) == repr(number) == written
     assert Exact(written).fraction == fraction
@@ -33,14 +33,14 @@ def test_text_is_kept_exactly(text: str, fraction: Fraction, written: str) -> No
 
 @given(st.fractions() | st.decimals(allow_nan=False, allow_infinity=False, min_value=-(10**9), max_value=10**9))
 def test_fractions_and_decimals_are_kept(value: Fraction | Decimal) -> None:
-    assert exact(Exact(value)) == Fraction(value)
-    assert exact(Exact(str(Exact(value)))) == Fraction(value)
+    assert to_fraction(Exact(value)) == Fraction(value)
+    assert to_fraction(Exact(str(Exact(value)))) == Fraction(value)
 
 
 def test_a_float_is_the_decimal_that_it_prints() -> None:
-    assert exact(0.1) == Fraction(1, 10) != Fraction(0.1)
-    assert exact(Exact(0.1)) == Fraction(1, 10)
-    assert exact(3) == 3
+    assert to_fraction(0.1) == Fraction(1, 10) != Fraction(0.1)
+    assert to_fraction(Exact(0.1)) == Fraction(1, 10)
+    assert to_fraction(3) == 3
 
 
 def test_infinity() -> None:
@@ -49,7 +49,7 @@ def test_infinity() -> None:
         assert Exact(text).fraction is None
     assert str(Exact("inf")) == "inf"
     with pytest.raises(OverflowError):
-        exact(Exact("inf"))
+        to_fraction(Exact("inf"))
 
 
 @pytest.mark.parametrize("text", ["", "nan", "much", "1/0", "1e400", "1/2/3"])
@@ -59,4 +59,4 @@ def test_no_number(text: str) -> None:
 
 
 def test_a_copy_is_as_exact() -> None:
-    assert exact(pickle.loads(pickle.dumps(Exact("1/3")))) == Fraction(1, 3)
+    assert to_fraction(pickle.loads(pickle.dumps(Exact("1/3")))) == Fraction(1, 3)

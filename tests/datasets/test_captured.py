@@ -1,4 +1,4 @@
-"""Structure from motion of rendered views, whose cameras it must find again, knowing nothing of them."""
+"""Structure from motion of rendered views must recover their cameras."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fakes import album
+from fakes import write_album
 from PIL import Image
 from scipy.spatial.distance import pdist
 
@@ -23,7 +23,7 @@ FIRST, COUNT = 84, 9
 
 @pytest.fixture(scope="module")
 def truth() -> list[SceneImage]:
-    """A stretch of the walk around the courtyard."""
+    """Consecutive views of the walk around the courtyard."""
     return list(WALK.scene().references[FIRST : FIRST + COUNT])
 
 
@@ -52,9 +52,9 @@ def centres(images: list[SceneImage]) -> np.ndarray:
     return np.array([image.cam_from_world.inverse().translation for image in images])
 
 
-def test_structure_from_motion_finds_the_gallery_s_cameras(dataset: Captured, truth: list[SceneImage]) -> None:
+def test_structure_from_motion_recovers_the_gallery_s_cameras(dataset: Captured, truth: list[SceneImage]) -> None:
     scene = dataset.scene()
-    assert scene.left_out == ()
+    assert scene.excluded_images == ()
     assert [query.name for query in scene.queries] == ["0.png", "4.png", "8.png"]
     assert len(scene.references) == COUNT - 3
     found = sorted(scene.references + scene.queries, key=lambda image: image.name)
@@ -68,7 +68,7 @@ def test_structure_from_motion_finds_the_gallery_s_cameras(dataset: Captured, tr
     assert found[0].pixels.read().shape == (300, 400, 3)
 
 
-def test_queries_can_be_a_stretch(dataset: Captured) -> None:
+def test_queries_can_be_consecutive(dataset: Captured) -> None:
     scene = replace(dataset, leading=4).scene()
     assert [query.name for query in scene.queries] == ["0.png", "1.png", "2.png", "3.png"]
     assert len(scene.references) == COUNT - 4
@@ -76,16 +76,16 @@ def test_queries_can_be_a_stretch(dataset: Captured) -> None:
         replace(dataset, leading=COUNT).scene()
 
 
-def test_model_is_kept_by_content(dataset: Captured, photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_model_is_cached_by_content(dataset: Captured, photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = dataset.scene()
 
-    class RemadeError(Exception):
+    class RebuiltError(Exception):
         pass
 
-    def remake(*arguments: object) -> None:
-        raise RemadeError
+    def rebuild(*arguments: object) -> None:
+        raise RebuiltError
 
-    monkeypatch.setattr(captured, "_structure_from_motion", remake)
+    monkeypatch.setattr(captured, "_run_structure_from_motion", rebuild)
     twice = replace(dataset, length=2 * dataset.length).scene()
     np.testing.assert_allclose(centres(twice.references), 2 * centres(before.references))
     assert twice.unit == f"{2 * dataset.length:g} between the cameras of 0.png and 8.png"
@@ -95,23 +95,23 @@ def test_model_is_kept_by_content(dataset: Captured, photographs: Path, tmp_path
         (copied / path.name).write_bytes(path.read_bytes())
     assert len(replace(dataset, path=copied).scene().references) == len(before.references)  # the same content elsewhere
     Image.open(copied / "3.png").transpose(Image.Transpose.ROTATE_180).save(copied / "3.png")
-    with pytest.raises(RemadeError):
+    with pytest.raises(RebuiltError):
         replace(dataset, path=copied).scene()
 
 
-def test_unit_must_be_fixed_by_two_photographs_that_have_a_place(dataset: Captured) -> None:
+def test_unit_must_be_fixed_by_two_photographs_with_poses(dataset: Captured) -> None:
     with pytest.raises(UserError, match=r"99\.png, which fixes the unit of length, has no pose; name another"):
         replace(dataset, second="99.png").scene()
-    with pytest.raises(UserError, match=r"0\.png and 0\.png were taken from one place"):
+    with pytest.raises(UserError, match=r"0\.png and 0\.png have the same position"):
         replace(dataset, second="0.png").scene()
     assert replace(dataset, first=None, second=None).scene().unit.endswith("between the cameras of 0.png and 4.png")
 
 
-def test_photographs_of_nothing_in_common(tmp_path: Path) -> None:
-    before = [entry for entry in store.entries() if entry.kind == "models"]
+def test_photographs_without_overlap_are_refused(tmp_path: Path) -> None:
+    before = [entry for entry in store.list_entries() if entry.kind == "models"]
     with pytest.raises(UserError, match="structure from motion found no model; do the photographs overlap"):
-        Captured(path=album(tmp_path / "noise", 3)).scene()
-    assert [entry for entry in store.entries() if entry.kind == "models"] == before
+        Captured(path=write_album(tmp_path / "noise", 3)).scene()
+    assert [entry for entry in store.list_entries() if entry.kind == "models"] == before
 
 
 @pytest.mark.parametrize("fields", [{"held_out": 1}, {"leading": -1}, {"length": 0.0}, {"length": float("nan")}])

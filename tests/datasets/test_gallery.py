@@ -15,12 +15,12 @@ from scipy.spatial.transform import Rotation
 
 from bench.core.errors import UserError
 from bench.datasets import gallery
-from bench.datasets.gallery import Gallery, Shot, shot
+from bench.datasets.gallery import Gallery, Shot, render
 from bench.images import photographs
 from bench.images.scene import Reference, Scene
 from bench.rendering import walks
 from bench.rendering.furniture import furnish
-from bench.rendering.rooms import DOORS, ROOMS, walls
+from bench.rendering.rooms import DOORS, ROOMS, list_walls
 
 SMALL = Gallery(views=12, queries=6, width=320, height=240, detail=0.4, rooms=1, people=3.0)
 
@@ -69,7 +69,7 @@ def test_matches_of_two_views_agree_with_the_poses(index: int) -> None:
     """SIFT knows nothing of the poses; what it matches lies where the poses and depths say, to a pixel."""
     walk = replace(SMALL, views=80, people=0.0)
     one, other = walk.scene().references[index : index + 2]
-    seen = shot(walk, "reference", index)
+    seen = render(walk, "reference", index)
     (points, descriptors), (expected, others) = sift(seen.pixels), sift(other.pixels.read())
     column, row = points.astype(int).T
     placed = np.isfinite(seen.depth[row, column])  # the sky has no place
@@ -92,7 +92,7 @@ def test_matches_of_two_views_agree_with_the_poses(index: int) -> None:
 def test_same_seed_same_pixels_and_another_seed_another_gallery(scene: Scene) -> None:
     source = scene.references[0].pixels
     before = source.read()
-    for cached in (gallery._model, gallery._building, shot):
+    for cached in (gallery._load_model, gallery._load_building, render):
         cached.cache_clear()
     again = pickle.loads(pickle.dumps(source))
     assert again.content_hash() == source.content_hash() != scene.references[1].pixels.content_hash()
@@ -119,7 +119,7 @@ def test_masks_cover_the_people_and_nothing_else() -> None:
     crowded, empty = replace(SMALL, people=4.0), replace(SMALL, people=0.0)
     total = 0
     for index in range(3):
-        one, other = shot(crowded, "query", index), shot(empty, "query", index)
+        one, other = render(crowded, "query", index), render(empty, "query", index)
         assert not other.foreground.any()
         differs = np.abs(1 / one.depth - 1 / other.depth) > 1e-3
         edge = binary_dilation(one.foreground, iterations=1)
@@ -130,22 +130,26 @@ def test_masks_cover_the_people_and_nothing_else() -> None:
 
 
 def test_people_of_the_map_and_of_queries_have_nothing_in_common() -> None:
-    drawn = [hashlib.sha256(person.pixels.tobytes()).digest() for people in gallery._cast(0).values() for person in people]
-    assert len(set(drawn)) == len(drawn) == 2 * gallery.CAST
+    drawn = [
+        hashlib.sha256(person.pixels.tobytes()).digest() for people in gallery._create_people(0).values() for person in people
+    ]
+    assert len(set(drawn)) == len(drawn) == 2 * gallery.PEOPLE
 
 
 def test_no_picture_of_a_person_hangs_in_the_map() -> None:
     def hashes(sources: list[photographs.Source]) -> set[str]:
         return {source.content_hash() for source in sources}
 
-    assert len(hashes(photographs.of_people())) == 3
-    assert not hashes(photographs.of_people()) & (hashes(photographs.of_things()) | hashes(photographs.of_grounds()))
+    assert len(hashes(photographs.list_people())) == 3
+    assert not hashes(photographs.list_people()) & (
+        hashes(photographs.list_objects()) | hashes(photographs.list_ground_textures())
+    )
 
 
 def test_night_is_darker_noisier_and_otherwise_the_same() -> None:
     day, night = replace(SMALL, night=0.0, queries=2), replace(SMALL, night=1.0, queries=2)
     for index in range(2):
-        one, other = shot(day, "query", index), shot(night, "query", index)
+        one, other = render(day, "query", index), render(night, "query", index)
         np.testing.assert_array_equal(one.depth, other.depth)
         np.testing.assert_array_equal(one.foreground, other.foreground)
         assert noise(other.pixels) > 1.5 * noise(one.pixels)
@@ -162,16 +166,18 @@ def noise(pixels: np.ndarray) -> float:
 
 
 def test_fields_make_queries_harder() -> None:
-    sharp = shot(replace(SMALL, blur=0.0, noise=0.0), "query", 0).pixels
-    blurred = shot(replace(SMALL, blur=3.0, noise=0.0), "query", 0).pixels
-    noisy = shot(replace(SMALL, blur=0.0, noise=8.0), "query", 0).pixels
+    sharp = render(replace(SMALL, blur=0.0, noise=0.0), "query", 0).pixels
+    blurred = render(replace(SMALL, blur=3.0, noise=0.0), "query", 0).pixels
+    noisy = render(replace(SMALL, blur=0.0, noise=8.0), "query", 0).pixels
     assert cv2.Laplacian(blurred, cv2.CV_32F).std() < 0.6 * cv2.Laplacian(sharp, cv2.CV_32F).std()
     assert noise(noisy) > 2 * noise(sharp)
 
     def departure(viewpoint: float) -> float:
         """How far queries are from a thousand references, in metres, on average."""
         queries = replace(SMALL, viewpoint=viewpoint, queries=30).scene().queries
-        places = np.array([walks.on_walk(ROOMS[0], lap, share).centre for lap in range(2) for share in np.linspace(0, 1, 500)])
+        places = np.array(
+            [walks.compute_station(ROOMS[0], lap, share).centre for lap in range(2) for share in np.linspace(0, 1, 500)]
+        )
         centres = np.array([query.cam_from_world.inverse().translation for query in queries])
         return float(np.linalg.norm(centres[:, None] - places[None], axis=2).min(axis=1).mean())
 
@@ -192,20 +198,20 @@ def test_bare_walls_and_repeated_pictures() -> None:
 
 def test_cameras_stand_free_in_the_rooms(scene: Scene) -> None:
     everywhere = replace(SMALL, rooms=len(ROOMS), views=60, queries=60)
-    building = gallery._model(everywhere).building
+    building = gallery._load_model(everywhere).building
     visited = set()
     for image in everywhere.scene().references + everywhere.scene().queries:
         x, y, z = image.cam_from_world.inverse().translation
-        assert building.free(x, y, walks.MARGIN)
+        assert building.is_free(x, y, walks.MARGIN)
         assert 1.1 < z < 2.0
-        visited |= {room.name for room in ROOMS if room.holds(x, y)}
+        visited |= {room.name for room in ROOMS if room.contains(x, y)}
         up = image.cam_from_world.rotation.matrix()[:, 2]  # the world's up in the camera
         assert up[1] < -0.9  # points against y, which goes down
     assert visited == {room.name for room in ROOMS}
 
 
 def test_doors_lead_from_room_to_room() -> None:
-    openings = sum(len(wall.openings) for room in ROOMS for wall in walls(room))
+    openings = sum(len(wall.openings) for room in ROOMS for wall in list_walls(room))
     assert openings == 2 * len(DOORS)
 
 

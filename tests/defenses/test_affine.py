@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from bench.api import Asset, Privacy
+from bench.api import Privacy
 from bench.codebook import dictionary
 from bench.codebook.public import Public
 from bench.core.errors import SampleError, UserError
 from bench.geometry.nearest_words import unit_rows
+from bench.settings import Asset
 from bench.testing import same
 from bench.types import Features
 from defenses.affine import PLUGIN as AFFINE
@@ -107,7 +108,7 @@ Parameters = tuple[np.ndarray, np.ndarray]
 Reparameterise = Callable[[np.ndarray, np.ndarray, np.random.Generator], Parameters]
 
 
-def lifted(count: int = 200, dim: int = 4, adversarial: int = 2) -> Parameters:
+def lift_examples(count: int = 200, dim: int = 4, adversarial: int = 2) -> Parameters:
     """Descriptors (N, D) and orthonormal directions (N, dim, D)."""
     d = make_features(count).descriptors.astype(float)
     return d, lift(d, make_words(), adversarial, dim, np.random.default_rng(7))[0]
@@ -115,7 +116,7 @@ def lifted(count: int = 200, dim: int = 4, adversarial: int = 2) -> Parameters:
 
 def hides_the_descriptor(reparameterise: Reparameterise) -> bool:
     """The origin is as far from d as the projection of U([-1, 1])^n is: |d − o|² = |P(d − e)|², about dim / 3."""
-    d, span = lifted()
+    d, span = lift_examples()
     origins, _ = reparameterise(d, span, np.random.default_rng(0))
     far = np.square(origins - d).sum(axis=1)
     return bool(far.min() > 1e-3 and abs(far.mean() - 4 / 3) < 0.4)
@@ -123,7 +124,7 @@ def hides_the_descriptor(reparameterise: Reparameterise) -> bool:
 
 def shares_nothing_but_d(reparameterise: Reparameterise) -> bool:
     """Two re-parameterisations of one D: the same D to 1e-5, and bases and origins that say nothing of each other."""
-    d, span = lifted()
+    d, span = lift_examples()
     (o1, b1), (o2, b2) = (reparameterise(d, span, np.random.default_rng(seed)) for seed in (1, 2))
     assert np.abs(projectors(b1) - projectors(b2)).max() < EXACT
     apart = (o2 - o1).astype(float)
@@ -135,9 +136,9 @@ def shares_nothing_but_d(reparameterise: Reparameterise) -> bool:
     return bool(unlike and np.linalg.norm(apart, axis=1).min() > 1e-3)
 
 
-def invariant(reparameterise: Reparameterise) -> bool:
+def is_invariant(reparameterise: Reparameterise) -> bool:
     """With the same random vectors, any point and any basis that describe D give the same release."""
-    d, span = lifted()
+    d, span = lift_examples()
     rng = np.random.default_rng(3)
     turn = np.linalg.qr(rng.normal(size=(len(d), 4, 4))).Q
     elsewhere = d + np.einsum("ni,nid->nd", rng.normal(size=(len(d), 4)), span)
@@ -164,7 +165,7 @@ def keeps_lapacks_signs(d: np.ndarray, span: np.ndarray, rng: np.random.Generato
 
 def hides_the_directions(reparameterise: Reparameterise) -> bool:
     """The first basis vector lies on either side of the first direction, that of an adversarial word from d, equally often."""
-    d, span = lifted(1000)
+    d, span = lift_examples(1000)
     _, bases = reparameterise(d, span, np.random.default_rng(0))
     cosines = np.einsum("nid,njd->ijn", bases, span)  # (dim, dim, N)
     sides = (cosines > 0).sum(axis=2)
@@ -174,23 +175,23 @@ def hides_the_directions(reparameterise: Reparameterise) -> bool:
 def test_reparameterisation() -> None:
     assert hides_the_descriptor(reparameterise)
     assert shares_nothing_but_d(reparameterise)
-    assert invariant(reparameterise)
+    assert is_invariant(reparameterise)
     assert hides_the_directions(reparameterise)
 
 
 def test_control_an_origin_at_the_descriptor_is_caught() -> None:
     assert not hides_the_descriptor(keeps_the_origin)
     assert not shares_nothing_but_d(keeps_the_origin)
-    assert not invariant(keeps_the_origin)
+    assert not is_invariant(keeps_the_origin)
 
 
 def test_control_a_basis_used_twice_is_caught() -> None:
     assert not shares_nothing_but_d(keeps_the_basis)
-    assert not invariant(keeps_the_basis)
+    assert not is_invariant(keeps_the_basis)
 
 
 def test_control_a_basis_with_lapacks_signs_is_caught() -> None:
-    assert not invariant(keeps_lapacks_signs)
+    assert not is_invariant(keeps_lapacks_signs)
     assert not hides_the_directions(keeps_lapacks_signs)
 
 

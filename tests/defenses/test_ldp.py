@@ -17,23 +17,24 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from bench.api import Asset, Privacy
+from bench.api import Privacy
 from bench.codebook import dictionary
 from bench.codebook.public import Public
 from bench.core.errors import UserError
-from bench.core.exact import Exact, exact
+from bench.core.exact import Exact, to_fraction
 from bench.geometry.nearest_words import unit_rows
 from bench.mechanisms import protection
 from bench.mechanisms.subset import (
     chance_digits,
     draw_distinct,
-    draw_told,
-    information,
+    draw_inclusion,
+    draw_word_subsets,
     log10_chance,
     most_accurate_size,
     most_informative_size,
-    word_subsets,
+    mutual_information,
 )
+from bench.settings import Asset
 from bench.types import Features
 from defenses.ldp import PLUGIN as LDP
 
@@ -57,7 +58,7 @@ def exp_bounds(power: Fraction, terms: int) -> tuple[Fraction, Fraction]:
 
 def chance_bounds(epsilon: float, domain: int, size: int, terms: int = 160) -> tuple[Fraction, Fraction]:
     """Eq. (5) in rationals."""
-    bounds = exp_bounds(exact(epsilon), terms)
+    bounds = exp_bounds(to_fraction(epsilon), terms)
     low, high = (size * power / (size * power + domain - size) for power in bounds)
     return low, high
 
@@ -72,7 +73,7 @@ def chance(epsilon: float, domain: int, size: int) -> float:
     return weight / (weight + domain - size)
 
 
-def enumerated(epsilon: float, domain: int, size: int) -> dict[tuple[int, ...], list[float]]:
+def enumerate_sets(epsilon: float, domain: int, size: int) -> dict[tuple[int, ...], list[float]]:
     """Pr(Z | v) for all sets Z and all v, with the normalisation of DESIGN.md."""
     total = size * math.exp(epsilon) + domain - size
     inside, outside = (domain * weight / total / math.comb(domain, size) for weight in (math.exp(epsilon), 1.0))
@@ -186,7 +187,7 @@ def test_draw_goes_on_where_the_bits_equal_those_of_p(epsilon: float, domain: in
     numbers = [number for number in near if 0 <= number < 2**320]
     expected = [Fraction(number, 2**320) < low for number in numbers]
     rng = Scripted(numbers, digits)
-    told = draw_told(len(numbers), epsilon, domain, size, rng)  # type: ignore[arg-type]
+    told = draw_inclusion(len(numbers), epsilon, domain, size, rng)  # type: ignore[arg-type]
     assert told.tolist() == expected
     assert rng.calls == 5
     # The control: 64 bits alone decide wrongly, unless p is so small that no row is told either way.
@@ -195,10 +196,10 @@ def test_draw_goes_on_where_the_bits_equal_those_of_p(epsilon: float, domain: in
 
 def test_draw_of_certainty_and_of_nothing() -> None:
     rng = np.random.default_rng(0)
-    assert draw_told(1000, math.inf, 6, 2, rng).all()
-    assert draw_told(1000, 3.0, 2, 2, rng).all()
-    assert draw_told(0, 3.0, 6, 2, rng).shape == (0,)
-    assert not draw_told(1000, 10.0, 2**4096, 2, rng).any()
+    assert draw_inclusion(1000, math.inf, 6, 2, rng).all()
+    assert draw_inclusion(1000, 3.0, 2, 2, rng).all()
+    assert draw_inclusion(0, 3.0, 6, 2, rng).shape == (0,)
+    assert not draw_inclusion(1000, 10.0, 2**4096, 2, rng).any()
 
 
 # ---- the distribution of the sets
@@ -208,7 +209,7 @@ def subsets_fit(sampler: Sampler, domain: int, size: int, epsilon: float, draws:
     """p-value of χ² between `draws` sets and the enumeration."""
     rng = np.random.default_rng([domain, size, int(epsilon * 10)])
     words = sampler(np.full(draws, true), domain, epsilon, size, rng)
-    law = enumerated(epsilon, domain, size)
+    law = enumerate_sets(epsilon, domain, size)
     codes = np.bincount((np.sort(words, axis=1) * domain ** np.arange(size)).sum(axis=1), minlength=domain**size)
     observed = [int(codes[sum(word * domain**place for place, word in enumerate(Z))]) for Z in law]
     assert sum(observed) == draws, "a row is no set of `size` words"
@@ -222,12 +223,12 @@ CASES = [(12, 3, 2.0), (6, 2, 0.0), (6, 2, 1.0), (6, 2, 3.0), (6, 3, 0.0), (6, 3
 
 @pytest.mark.parametrize(("domain", "size", "epsilon"), CASES)
 def test_sets_against_enumeration(domain: int, size: int, epsilon: float) -> None:
-    assert subsets_fit(word_subsets, domain, size, epsilon) > ALPHA
+    assert subsets_fit(draw_word_subsets, domain, size, epsilon) > ALPHA
 
 
 def test_enumeration_sums_to_one_and_its_ratio_is_e_to_the_epsilon() -> None:
     for domain, size, epsilon in CASES:
-        law = enumerated(epsilon, domain, size)
+        law = enumerate_sets(epsilon, domain, size)
         np.testing.assert_allclose(np.sum(list(law.values()), axis=0), 1.0, rtol=1e-12)
         ratio = max(max(row) / min(row) for row in law.values())
         assert ratio == pytest.approx(math.exp(epsilon), rel=1e-12)
@@ -279,8 +280,8 @@ def test_control_a_wrong_p_fails(wrong: Callable[[float, int, int], float], size
 def test_control_others_that_may_be_the_true_word_fail() -> None:
     def unshifted(true: np.ndarray, domain: int, epsilon: float, size: int, rng: np.random.Generator) -> np.ndarray:
         """Draws the others from all of K where u = 0."""
-        told = draw_told(len(true), epsilon, domain, size, rng)
-        words = word_subsets(true, domain, math.inf, size, rng)
+        told = draw_inclusion(len(true), epsilon, domain, size, rng)
+        words = draw_word_subsets(true, domain, math.inf, size, rng)
         words[~told] = draw_distinct(int((~told).sum()), domain, size, rng)
         return words
 
@@ -314,7 +315,7 @@ def test_inclusion_at_full_size() -> None:
     domain, size, epsilon, draws = 256_000, 2, 10.0, 400_000
     rng = np.random.default_rng(0)
     true = rng.integers(domain, size=draws)
-    words = word_subsets(true, domain, epsilon, size, rng)
+    words = draw_word_subsets(true, domain, epsilon, size, rng)
     told = (words == true[:, None]).any(axis=1)
     expected = chance(epsilon, domain, size)
     assert expected == pytest.approx(0.1468, abs=1e-4)
@@ -348,7 +349,7 @@ def test_more_distinct_numbers_than_there_are() -> None:
 def test_every_row_is_a_set_of_words(domain: int, epsilon: float, data: st.DataObject) -> None:
     size = data.draw(st.integers(1, domain))
     true = np.array(data.draw(st.lists(st.integers(0, domain - 1), max_size=20)), dtype=np.int64)
-    words = word_subsets(true, domain, epsilon, size, np.random.default_rng(data.draw(st.integers(0, 2**32))))
+    words = draw_word_subsets(true, domain, epsilon, size, np.random.default_rng(data.draw(st.integers(0, 2**32))))
     assert words.shape == (len(true), size)
     assert (np.diff(words, axis=1) > 0).all()
     assert words.size == 0 or (words.min() >= 0 and words.max() < domain)
@@ -369,8 +370,8 @@ def order_fits(sampler: Sampler, domain: int = 1000, size: int = 3) -> float:
 
 
 def test_order_carries_nothing() -> None:
-    assert order_fits(word_subsets) > ALPHA
-    words = word_subsets(np.arange(1000), 1000, 5.0, 4, np.random.default_rng(0))
+    assert order_fits(draw_word_subsets) > ALPHA
+    words = draw_word_subsets(np.arange(1000), 1000, 5.0, 4, np.random.default_rng(0))
     assert (np.diff(words, axis=1) > 0).all()  # a function of the set alone
 
 
@@ -384,10 +385,10 @@ def test_control_the_true_word_first_is_caught() -> None:
 
 @pytest.mark.parametrize(("domain", "size", "epsilon"), CASES)
 def test_information_against_enumeration(domain: int, size: int, epsilon: float) -> None:
-    law = np.array(list(enumerated(epsilon, domain, size).values()))  # (sets, words)
+    law = np.array(list(enumerate_sets(epsilon, domain, size).values()))  # (sets, words)
     marginal = law.mean(axis=1, keepdims=True)
     expected = (law / domain * np.log(law / marginal)).sum()
-    assert information(epsilon, domain, np.array([size]))[0] == pytest.approx(expected, rel=1e-12, abs=1e-12)
+    assert mutual_information(epsilon, domain, np.array([size]))[0] == pytest.approx(expected, rel=1e-12, abs=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -410,7 +411,7 @@ def test_the_two_optima_at_full_size() -> None:
     """|K| / (e^ε + 1) is not where mutual information is greatest: that is at nine times as many words."""
     assert most_accurate_size(10.0, 256_000) == most_accurate_size(10.0, 262_144) == 12
     assert most_informative_size(10.0, 256_000) == 105
-    tells = information(10.0, 256_000, np.array([2, 12, 105]))
+    tells = mutual_information(10.0, 256_000, np.array([2, 12, 105]))
     assert tells[2] > 1.5 * tells[1] > 4 * tells[0]
     assert most_informative_size(0.01, 1000) == pytest.approx(500, abs=3) == most_accurate_size(0.01, 1000)
     assert most_informative_size(math.inf, 1000) == 1
@@ -451,9 +452,9 @@ def test_inclusion_rates_against_multi_freq_ldpy() -> None:
         others = stats.chi2_contingency([np.delete(mine, true), np.delete(theirs, true)])
         return min(told.pvalue, others.pvalue)
 
-    assert agree(word_subsets(np.full(rows, true), domain, epsilon, size, rng)) > ALPHA
-    assert agree(word_subsets(np.full(rows, true), domain, epsilon + 0.1, size, rng)) < ALPHA  # the controls
-    assert agree(np.minimum(word_subsets(np.full(rows, true), domain, epsilon, size, rng), domain - 2)) < ALPHA
+    assert agree(draw_word_subsets(np.full(rows, true), domain, epsilon, size, rng)) > ALPHA
+    assert agree(draw_word_subsets(np.full(rows, true), domain, epsilon + 0.1, size, rng)) < ALPHA  # the controls
+    assert agree(np.minimum(draw_word_subsets(np.full(rows, true), domain, epsilon, size, rng), domain - 2)) < ALPHA
 
 
 # ---- the plugin
@@ -525,7 +526,7 @@ def test_the_plugins_sets_against_enumeration(tmp_path: Path) -> None:
     nearest = nearest_by_hand(secret, public.dictionary(asset).words)
     release = LDP(dictionary=asset, epsilon=1.0, subset_size=2).protect(secret, public, np.random.default_rng(3))
     assert release.words is not None
-    law = enumerated(1.0, 6, 2)
+    law = enumerate_sets(1.0, 6, 2)
     table = np.zeros((6, len(law)), dtype=int)
     columns = {Z: column for column, Z in enumerate(law)}
     for true, Z in zip(nearest.tolist(), map(tuple, release.words.tolist()), strict=True):
@@ -536,7 +537,7 @@ def test_the_plugins_sets_against_enumeration(tmp_path: Path) -> None:
     statistic = ((table - expected)[used] ** 2 / expected[used]).sum()
     assert stats.chi2.sf(statistic, used.sum() * (len(law) - 1)) > ALPHA
     # The control: read as a release of ε = 1.2, it does not fit.
-    other = table.sum(axis=1, keepdims=True) * np.array(list(enumerated(1.2, 6, 2).values())).T
+    other = table.sum(axis=1, keepdims=True) * np.array(list(enumerate_sets(1.2, 6, 2).values())).T
     assert stats.chi2.sf(((table - other)[used] ** 2 / other[used]).sum(), used.sum() * (len(law) - 1)) < ALPHA
 
 
@@ -630,7 +631,7 @@ def test_what_is_remembered_has_the_law_of_the_mechanism(tmp_path: Path) -> None
     draws = 4000
     releases = [defense.protect(one, public, np.random.default_rng(device)).words for device in range(draws)]
     found = [tuple(words[0].tolist()) for words in releases if words is not None]
-    law = enumerated(1.0, 6, 2)
+    law = enumerate_sets(1.0, 6, 2)
     observed, expected = [found.count(Z) for Z in law], [draws * by_word[nearest] for by_word in law.values()]
     assert stats.chisquare(observed, expected).pvalue > ALPHA
     wrong = [draws * by_word[(nearest + 1) % 6] for by_word in law.values()]
@@ -654,10 +655,10 @@ SPEEDS = [(2, 64, "seeded"), (2, 256_000, "seeded"), (2, 2**30, "seeded"), (12, 
 
 def works(size: int, domain: int, generator: str) -> dict[str, Callable[[], object]]:
     """Sampling, and its floor: m + 1 random 64-bit words a descriptor."""
-    rng = protection.generator(bytes(32)) if generator == "cipher" else np.random.default_rng(0)
+    rng = protection.create_generator(bytes(32)) if generator == "cipher" else np.random.default_rng(0)
     true = np.random.default_rng(1).integers(domain, size=ROWS)
     return {
-        "sets": lambda: word_subsets(true, domain, 10.0, size, rng),
+        "sets": lambda: draw_word_subsets(true, domain, 10.0, size, rng),
         "random words": lambda: rng.integers(2**64 - 1, size=(ROWS, size + 1), dtype=np.uint64, endpoint=True),
     }
 

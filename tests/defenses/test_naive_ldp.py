@@ -14,10 +14,10 @@ from bench.api import Privacy
 from bench.codebook.public import Public
 from bench.core.errors import UserError
 from bench.geometry.nearest_words import unit_rows
-from bench.mechanisms.subset import draw_told, pattern_subsets
+from bench.mechanisms.subset import draw_inclusion, draw_pattern_subsets
 from bench.types import Features
 from defenses.naive_ldp import PLUGIN as NAIVE
-from defenses.naive_ldp import finite_floats
+from defenses.naive_ldp import read_finite_floats
 
 ALPHA = 1e-4
 CERTAINLY_WRONG = 1e-9
@@ -30,7 +30,7 @@ def make_features(count: int, seed: int = 0, codes: bool = True) -> Features:
     return Features(keypoints=keypoints, descriptors=unit_rows(values), codes=values if codes else None, size=(64, 48))
 
 
-def repeated(epsilon: float, count: int) -> np.ndarray:
+def draw_repeatedly(epsilon: float, count: int) -> np.ndarray:
     """Where the descriptor is in its set, for many copies of one. -> (N, m) bool"""
     one = make_features(1)
     assert one.codes is not None
@@ -69,7 +69,7 @@ def pairs_fit(sampler: Sampler, epsilon: float, draws: int = 10**6, true: int = 
 
 @pytest.mark.parametrize("epsilon", [0.0, 1.0, 5.0])
 def test_sets_of_bytes_against_enumeration(epsilon: float) -> None:
-    assert pairs_fit(pattern_subsets, epsilon) > ALPHA
+    assert pairs_fit(draw_pattern_subsets, epsilon) > ALPHA
 
 
 def test_control_an_approximate_domain_fails() -> None:
@@ -79,11 +79,11 @@ def test_control_an_approximate_domain_fails() -> None:
         def sample(true: np.ndarray, epsilon: float, size: int, rng: np.random.Generator) -> np.ndarray:
             told = rng.random(len(true)) < size * math.exp(epsilon) / domain
             drawn = np.empty((len(true), size, 1), dtype=np.uint8)
-            drawn[told] = pattern_subsets(true[told], math.inf, size, rng)
+            drawn[told] = draw_pattern_subsets(true[told], math.inf, size, rng)
             # Sets without the true byte: of ε = 0, those that lack it.
             rest = np.flatnonzero(~told)
             while len(rest):
-                drawn[rest] = pattern_subsets(true[rest], 0.0, size, rng)
+                drawn[rest] = draw_pattern_subsets(true[rest], 0.0, size, rng)
                 rest = rest[(drawn[rest] == true[rest, None]).any(axis=(1, 2))]
             return drawn
 
@@ -118,7 +118,7 @@ def test_repetitions_are_drawn_again() -> None:
     again = random[:2].copy()
     again[1, 0] = true[1]
     rng = Repeating(first, again)
-    drawn = pattern_subsets(true, 10.0, 2, rng)  # type: ignore[arg-type]
+    drawn = draw_pattern_subsets(true, 10.0, 2, rng)  # type: ignore[arg-type]
     assert not rng.given
     for row in range(3):
         assert len({bytes(pattern) for pattern in drawn[row]} | {bytes(true[row])}) == 3
@@ -131,7 +131,7 @@ def test_repetitions_are_drawn_again() -> None:
 def test_rows_are_in_byte_order(seed: int, size: int, length: int, epsilon: float) -> None:
     rng = np.random.default_rng(seed)
     true = rng.integers(256, size=(9, length), dtype=np.uint8) * rng.integers(2, size=(9, length), dtype=np.uint8)
-    for row in pattern_subsets(true, epsilon, size, rng):
+    for row in draw_pattern_subsets(true, epsilon, size, rng):
         patterns = [bytes(pattern) for pattern in row]
         assert patterns == sorted(set(patterns))
 
@@ -139,7 +139,7 @@ def test_rows_are_in_byte_order(seed: int, size: int, length: int, epsilon: floa
 def test_order_carries_nothing_and_the_control_is_caught() -> None:
     rng = np.random.default_rng(0)
     true = rng.integers(256, size=(50_000, 128), dtype=np.uint8)
-    drawn = pattern_subsets(true, math.inf, 2, rng)
+    drawn = draw_pattern_subsets(true, math.inf, 2, rng)
     first = (drawn[:, 0] == true).all(axis=1)
     assert stats.binomtest(int(first.sum()), len(true)).pvalue > ALPHA
     told_first = np.concatenate([true[:, None], np.where((drawn == true[:, None]).all(2, keepdims=True), 0, drawn)], axis=1)
@@ -159,14 +159,14 @@ def test_chance_of_the_true_pattern_in_log_space(element: Any, bits: int) -> Non
 
 
 def test_infinite_epsilon_always_tells() -> None:
-    told = repeated(math.inf, 50)
+    told = draw_repeatedly(math.inf, 50)
     assert (told.sum(axis=1) == 1).all()
     assert NAIVE(epsilon=math.inf).privacy(Public()) == Privacy("none", None, 0.0)
 
 
 def test_at_a_middling_chance_the_rate_is_right() -> None:
     """ε = 709 is about where p is one half in 1024 bits: e^ε is near the greatest double and |K| near its double."""
-    told = repeated(709.0, 5_000)
+    told = draw_repeatedly(709.0, 5_000)
     p = 1 / (1 + math.exp(1024 * math.log(2) - math.log(2) - 709))
     assert 0.4 < p < 0.6
     assert 10 ** NAIVE(epsilon=709.0).privacy(Public()).log10_true == pytest.approx(p, rel=1e-9)  # type: ignore[operator]
@@ -184,9 +184,9 @@ def told_behind_chance() -> float:
 
 
 def test_at_epsilon_10_nothing_is_told() -> None:
-    told = repeated(10.0, 5_000)
+    told = draw_repeatedly(10.0, 5_000)
     assert not told.any()
-    assert not draw_told(10**5, 10.0, 2**4096, 2, np.random.default_rng(0)).any()
+    assert not draw_inclusion(10**5, 10.0, 2**4096, 2, np.random.default_rng(0)).any()
 
 
 # ---- the release
@@ -220,7 +220,7 @@ def test_components_that_are_no_finite_number_are_read_as_zero() -> None:
     values[0, 1] = [np.inf, np.nan, -np.inf, np.nan]
     patterns = values.view(np.uint8)
     patterns[0, 1, 4:8] = [1, 0, 0x80, 0x7F]  # a signalling NaN
-    finite = finite_floats(patterns)
+    finite = read_finite_floats(patterns)
     np.testing.assert_array_equal(finite, [[[0, 3, 0, -4], [0, 0, 0, 0]]])
     np.testing.assert_allclose(unit_rows(finite), [[[0, 0.6, 0, -0.8], [0, 0, 0, 0]]], atol=1e-7)
 
@@ -229,7 +229,7 @@ def test_extreme_finite_patterns_scale_without_overflow() -> None:
     values = np.zeros((1, 2, 128), dtype="<f4")
     values[0, 0] = np.finfo(np.float32).max
     values[0, 1] = np.finfo(np.float32).smallest_subnormal
-    np.testing.assert_allclose(unit_rows(finite_floats(values.view(np.uint8))), 128**-0.5, rtol=1e-6)
+    np.testing.assert_allclose(unit_rows(read_finite_floats(values.view(np.uint8))), 128**-0.5, rtol=1e-6)
 
 
 @pytest.mark.parametrize(

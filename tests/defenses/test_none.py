@@ -4,10 +4,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fakes import texture
+from fakes import draw_texture
 
 from bench.api import Privacy
-from bench.codebook.examples import example_features
+from bench.codebook.examples import draw_features
 from bench.codebook.public import Public
 from bench.core.errors import UserError
 from bench.extractors.sift import Sift
@@ -37,7 +37,7 @@ def test_promises_nothing() -> None:
 
 @pytest.mark.parametrize(("sends", "columns"), [("positions", None), ("scale", 1), ("scale-and-orientation", 2)])
 def test_sends_of_a_keypoint_what_it_says(sends: Any, columns: int | None) -> None:
-    secret = Sift(upright=False).extract(np.array(texture(0, (256, 256))))
+    secret = Sift(upright=False).extract(np.array(draw_texture(0, (256, 256))))
     release = PLUGIN(sends=sends).protect(secret, Public(), np.random.default_rng(0))
     if columns is None:
         assert release.frames is None
@@ -48,12 +48,12 @@ def test_sends_of_a_keypoint_what_it_says(sends: Any, columns: int | None) -> No
 
 def test_cannot_send_what_the_extractor_does_not_tell() -> None:
     with pytest.raises(UserError, match="extractor does not tell"):
-        PLUGIN(sends="scale").protect(example_features(), Public(), np.random.default_rng(0))
+        PLUGIN(sends="scale").protect(draw_features(), Public(), np.random.default_rng(0))
 
 
 def test_scales_and_orientations_are_those_of_the_keypoints() -> None:
     """Twice the picture, twice the scale; a quarter turn, a quarter more of orientation."""
-    picture = texture(0, (128, 128))
+    picture = draw_texture(0, (128, 128))
     small = Sift(upright=False).extract(np.array(picture))
     large = Sift(upright=False).extract(np.array(picture.resize((256, 256))))
     assert 1.6 < np.median(large.frames[:, 0]) / np.median(small.frames[:, 0]) < 2.4

@@ -11,17 +11,17 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from bench.audit.auditor import audit, near_words
-from bench.audit.exhaustive import law
-from bench.codebook.examples import example_features, small_dictionary
+from bench.audit.auditor import audit, create_features_near_words
+from bench.audit.exhaustive import compute_law
+from bench.codebook.examples import draw_features, write_dictionary
 from bench.codebook.public import Public
 from bench.core.errors import UserError
 from bench.core.exact import Exact
 from bench.geometry.nearest_words import unit_rows
-from bench.mechanisms.subset import chance_digits, word_subsets
-from bench.types import Features, WordSets
+from bench.mechanisms.subset import chance_digits, draw_word_subsets
+from bench.types import Features, Points, WordSets
 from defenses.ldp import LDP
-from defenses.plateau import Plateau, plateau_subsets
+from defenses.plateau import Plateau, draw_plateau_subsets
 
 ALPHA, CERTAINLY_WRONG = 1e-4, 1e-9
 
@@ -40,7 +40,7 @@ CASES = [(7, 1, 1, 1.0), (7, 2, 2, 1.5), (6, 3, 2, 0.5), (8, 2, 4, 2.0), (5, 4, 
 def test_sets_against_the_theorem(domain: int, size: int, near: int, epsilon: float) -> None:
     draws = 100_000
     plateau = np.sort(np.random.default_rng(near).permutation(domain)[:near])
-    drawn = plateau_subsets(np.tile(plateau, (draws, 1)), domain, epsilon, size, np.random.default_rng(0))
+    drawn = draw_plateau_subsets(np.tile(plateau, (draws, 1)), domain, epsilon, size, np.random.default_rng(0))
     assert (np.diff(drawn, axis=1) > 0).all()
     seen = Counter(map(tuple, drawn.tolist()))
     expected = theorem(set(plateau.tolist()), domain, epsilon, size)
@@ -55,7 +55,7 @@ def test_the_sampler_has_the_law_of_the_theorem() -> None:
     domain, size, epsilon = 5, 2, 1.0
     meeting, every = math.comb(5, 2) - math.comb(3, 2), math.comb(5, 2)
     p = Fraction(chance_digits(epsilon, every, meeting, 128), 2**128)
-    found = law(lambda rng: tuple(plateau_subsets(np.array([[1, 3]]), domain, epsilon, size, rng)[0].tolist()))
+    found = compute_law(lambda rng: tuple(draw_plateau_subsets(np.array([[1, 3]]), domain, epsilon, size, rng)[0].tolist()))
     for Z in combinations(range(domain), size):
         expected = p / meeting if {1, 3} & set(Z) else (1 - p) / (every - meeting)
         assert found.chances[Z] <= expected + Fraction(1, 2**120)
@@ -65,8 +65,8 @@ def test_the_sampler_has_the_law_of_the_theorem() -> None:
 def test_a_plateau_of_one_is_ldp() -> None:
     for size in (1, 2):
         laws = [
-            law(lambda rng: tuple(plateau_subsets(np.array([[2]]), 4, 1.5, size, rng)[0].tolist())),  # noqa: B023
-            law(lambda rng: tuple(word_subsets(np.array([2]), 4, 1.5, size, rng)[0].tolist())),  # noqa: B023
+            compute_law(lambda rng: tuple(draw_plateau_subsets(np.array([[2]]), 4, 1.5, size, rng)[0].tolist())),  # noqa: B023
+            compute_law(lambda rng: tuple(draw_word_subsets(np.array([2]), 4, 1.5, size, rng)[0].tolist())),  # noqa: B023
         ]
         assert laws[0].chances.keys() == laws[1].chances.keys()
         for Z, chance in laws[0].chances.items():
@@ -74,10 +74,10 @@ def test_a_plateau_of_one_is_ldp() -> None:
 
 
 def test_near_words_are_told_nearly_as_often_as_the_true_one(tmp_path: Path) -> None:
-    public, asset = Public(), small_dictionary(tmp_path, 400)
+    public, asset = Public(), write_dictionary(tmp_path, 400)
     known = public.dictionary(asset)
-    secrets = near_words(LDP(dictionary=asset), public).take(np.full(4000, 17))
-    T = known.neighbours.nearest(np.array([17]), 4)[0]
+    secrets = create_features_near_words(LDP(dictionary=asset), public).take(np.full(4000, 17))
+    T = known.neighbours.find_nearest(np.array([17]), 4)[0]
     release = Plateau(epsilon=4.0, near=4, dictionary=asset).protect(secrets, public, np.random.default_rng(0))
     rates = np.array([(release.words == word).any(axis=1).mean() for word in T])
     promised = 10 ** (Plateau(epsilon=4.0, near=4, dictionary=asset).privacy(public).log10_true or 0)
@@ -89,10 +89,10 @@ def test_near_words_are_told_nearly_as_often_as_the_true_one(tmp_path: Path) -> 
 
 def test_the_chance_of_the_true_word_against_the_theorem(tmp_path: Path) -> None:
     for domain, size, near, epsilon in ((12, 3, 4, 1.5), (9, 1, 2, 0.5), (6, 4, 3, 2.0)):
-        defense = Plateau(epsilon=epsilon, subset_size=size, near=near, dictionary=small_dictionary(tmp_path, domain))
+        defense = Plateau(epsilon=epsilon, subset_size=size, near=near, dictionary=write_dictionary(tmp_path, domain))
         expected = sum(chance for Z, chance in theorem(set(range(near)), domain, epsilon, size).items() if 0 in Z)
         assert 10 ** (defense.privacy(Public()).log10_true or 0) == pytest.approx(expected, rel=1e-9)
-    assert Plateau(epsilon=math.inf, dictionary=small_dictionary(tmp_path)).privacy(Public()).guarantee == "none"
+    assert Plateau(epsilon=math.inf, dictionary=write_dictionary(tmp_path)).privacy(Public()).guarantee == "none"
 
 
 # ---- the audit
@@ -121,7 +121,7 @@ class OneWordForAll(Plateau):
         release = super().protect(secret, public, rng)
         true, words = public.nearest_words(self.dictionary, secret), release.words
         assert words is not None
-        met = (known.neighbours.nearest(true, self.near)[:, :, None] == words[:, None]).any(axis=(1, 2))
+        met = (known.neighbours.find_nearest(true, self.near)[:, :, None] == words[:, None]).any(axis=(1, 2))
         words[met & ~(words == true[:, None]).any(axis=1), 0] = true[met & ~(words == true[:, None]).any(axis=1)]
         words = np.sort(words, axis=1)
         return dataclasses.replace(release, words=words, candidates=unit_rows(known.words[words]))
@@ -135,16 +135,19 @@ class AsManyAsAreAlike(Plateau):
         known = public.dictionary(self.dictionary)
         words = np.empty((len(secret), self.subset_size), dtype=np.int64)
         for row, true in enumerate(public.nearest_words(self.dictionary, secret)):
-            plateau = known.neighbours.nearest(np.array([true]), self.near + 1 if true < len(known) // 2 else 1)
-            words[row] = plateau_subsets(plateau, len(known), self.epsilon, self.subset_size, rng)[0]
+            plateau = known.neighbours.find_nearest(np.array([true]), self.near + 1 if true < len(known) // 2 else 1)
+            words[row] = draw_plateau_subsets(plateau, len(known), self.epsilon, self.subset_size, rng)[0]
         return WordSets(
-            keypoints=secret.keypoints.copy(), size=secret.size, candidates=unit_rows(known.words[words]), words=words
+            positions=Points(keypoints=secret.keypoints.copy()),
+            size=secret.size,
+            candidates=unit_rows(known.words[words]),
+            words=words,
         )
 
 
 def test_broken_ones_are_caught(tmp_path: Path) -> None:
     found = audit(OneWordForAll(epsilon=2.0), 64, 20_000, 0, tmp_path)
-    assert {finding.family for finding in found.findings if finding.certain > 2.0} >= {"membership"}
+    assert {finding.family for finding in found.findings if finding.certain_epsilon > 2.0} >= {"membership"}
     found = audit(AsManyAsAreAlike(epsilon=0.5, subset_size=1, near=2), 4, 400, 0, tmp_path)
     assert found.enumeration is not None
     assert found.enumeration.exceeds
@@ -168,6 +171,6 @@ def test_mistakes(given: dict[str, float], complaint: str) -> None:
 
 
 def test_a_dictionary_may_be_too_small(tmp_path: Path) -> None:
-    defense = Plateau(near=9, dictionary=small_dictionary(tmp_path, 8))
+    defense = Plateau(near=9, dictionary=write_dictionary(tmp_path, 8))
     with pytest.raises(UserError, match="near 9, but the dictionary has 8 words"):
-        defense.protect(example_features(3), Public(), np.random.default_rng(0))
+        defense.protect(draw_features(3), Public(), np.random.default_rng(0))

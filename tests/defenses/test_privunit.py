@@ -10,26 +10,26 @@ import pytest
 from scipy import stats
 
 from bench.audit.auditor import audit
-from bench.codebook.examples import example_features, small_dictionary
+from bench.codebook.examples import draw_features, write_dictionary
 from bench.codebook.public import Public
 from bench.core.errors import UserError
 from bench.localization import map_matching
 from bench.mechanisms.subset import chance_digits
 from bench.types import Descriptors, Features
-from defenses.privunit import GRID, PLACES, PrivUnit, cap, expected_cosine, latitude, near, without
+from defenses.privunit import BINARY_DIGITS, GRID, PrivUnit, choose_cap, draw_near, expected_cosine, latitude, remove_mean
 
 ALPHA, CERTAINLY_WRONG = 1e-4, 1e-9
 
 
 def directions(count: int, length: int) -> np.ndarray:
-    return without(np.random.default_rng(0).normal(size=(1, length)), None).repeat(count, axis=0)
+    return remove_mean(np.random.default_rng(0).normal(size=(1, length)), None).repeat(count, axis=0)
 
 
 def test_quotient_of_densities_is_e_to_the_epsilon() -> None:
     """p / q over (1 − p) / (1 − q), as fractions, to as many digits as are asked for."""
     for epsilon in (0.5, 2.0, 10.0, 100.0):
-        covered = cap(epsilon, 127)
-        p, q = Fraction(chance_digits(epsilon, 2**PLACES, covered, 512), 2**512), Fraction(covered, 2**PLACES)
+        covered = choose_cap(epsilon, 127)
+        p, q = Fraction(chance_digits(epsilon, 2**BINARY_DIGITS, covered, 512), 2**512), Fraction(covered, 2**BINARY_DIGITS)
         quotient = (p / q) / ((1 - p) / (1 - q))
         assert float(quotient) == pytest.approx(math.exp(epsilon), rel=1e-12)
 
@@ -48,19 +48,19 @@ def test_the_cap_is_the_best(epsilon: float, length: int) -> None:
             q * math.exp(epsilon) + 1 - q
         )
 
-    best = float(latitude(np.array([cap(epsilon, length) / 2**PLACES]), length)[0])
+    best = float(latitude(np.array([choose_cap(epsilon, length) / 2**BINARY_DIGITS]), length)[0])
     assert mean(best) == pytest.approx(expected_cosine(epsilon, length), rel=1e-4)
     assert all(mean(best) >= mean(other) - 1e-6 for other in np.linspace(0, 0.9, 50))
 
 
 def test_the_coordinate_along_the_descriptor() -> None:
     rows, length, epsilon = 20_000, 24, 5.0
-    drawn = near(directions(rows, length), None, epsilon, np.random.default_rng(1))
+    drawn = draw_near(directions(rows, length), None, epsilon, np.random.default_rng(1))
     np.testing.assert_allclose(np.linalg.norm(drawn, axis=1), 1)
     along = drawn @ directions(1, length)[0]
 
     def cumulative(x: np.ndarray, epsilon: float = epsilon) -> np.ndarray:
-        q, half = cap(epsilon, length) / 2**PLACES, (length - 1) / 2
+        q, half = choose_cap(epsilon, length) / 2**BINARY_DIGITS, (length - 1) / 2
         below = stats.beta.cdf((1 + x) / 2, half, half)  # of the uniform law
         inside = np.maximum(below - (1 - q), 0)
         return (below - inside + inside * math.exp(epsilon)) / (q * math.exp(epsilon) + 1 - q)
@@ -73,8 +73,8 @@ def test_the_coordinate_along_the_descriptor() -> None:
 def test_what_is_around_is_uniform() -> None:
     rows, length = 20_000, 8
     u = directions(rows, length)
-    drawn = near(u, None, 3.0, np.random.default_rng(2))
-    around = without(drawn - np.einsum("nd,nd->n", drawn, u)[:, None] * u, None)
+    drawn = draw_near(u, None, 3.0, np.random.default_rng(2))
+    around = remove_mean(drawn - np.einsum("nd,nd->n", drawn, u)[:, None] * u, None)
     frame = np.linalg.svd(u[:1])[2][1:]  # of what is at right angles to u
     uniform = stats.beta((length - 2) / 2, (length - 2) / 2)
     for axis in frame:
@@ -82,14 +82,14 @@ def test_what_is_around_is_uniform() -> None:
 
 
 def test_a_release_is_centred_and_on_the_grid(tmp_path: Path) -> None:
-    public, asset, secret = Public(), small_dictionary(tmp_path), example_features(500)
+    public, asset, secret = Public(), write_dictionary(tmp_path), draw_features(500)
     mean = public.dictionary(asset).mean
     assert np.linalg.norm(mean) == pytest.approx(1)
     centred = PrivUnit(epsilon=12.0, dictionary=asset).protect(secret, public, np.random.default_rng(0)).descriptors
     assert np.abs(centred @ mean).max() < 40 * GRID
     whole = PrivUnit(epsilon=12.0, centred=False, dictionary=asset).protect(secret, public, np.random.default_rng(0)).descriptors
     assert (whole @ mean).std() > 0.05
-    told = without(secret.descriptors.astype(np.float64), mean[None])
+    told = remove_mean(secret.descriptors.astype(np.float64), mean[None])
     cosines = np.einsum("nd,nd->n", centred, told)
     assert cosines.mean() == pytest.approx(expected_cosine(12.0, 127), abs=0.02)
     steps = np.abs(centred[0]) / np.diff(np.unique(np.abs(centred[0]))).min()  # differences are of whole steps
@@ -120,7 +120,7 @@ class AlwaysWithin(PrivUnit):
 def test_a_broken_one_is_caught(tmp_path: Path) -> None:
     found = audit(AlwaysWithin(epsilon=2.0), 64, 8000, 0, tmp_path)
     assert found.verdict == "violated"
-    assert {finding.family for finding in found.findings if finding.certain > 2.0} == {"projection"}
+    assert {finding.family for finding in found.findings if finding.certain_epsilon > 2.0} == {"projection"}
 
 
 # ---- what is asked
@@ -133,5 +133,5 @@ def test_mistakes(epsilon: float) -> None:
 
 
 def test_it_is_matched_without_lowes_test() -> None:
-    assert map_matching.default(PrivUnit()) == "noisy-nn"
+    assert map_matching.select_matcher(PrivUnit()) == "noisy-nn"
     assert map_matching.MATCHERS["noisy-nn"]().ratio == 1.0  # type: ignore[attr-defined]

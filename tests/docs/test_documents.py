@@ -8,10 +8,10 @@ import shlex
 from pathlib import Path
 
 import pytest
-from fakes import album
+from fakes import write_album
 
 from bench import cli
-from bench.cli import parser
+from bench.cli import build_parser
 from bench.registry import scaffold
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -68,10 +68,10 @@ def commands(page: str) -> list[str]:
 @pytest.fixture
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Photographs, results and a baseline, as whoever reads the documents has them."""
-    album(tmp_path / "photos", 3)
-    album(tmp_path / "one", 1)
-    album(tmp_path / "other-photos", 3, first=3)
-    album(tmp_path / "unseen", 3, first=6)
+    write_album(tmp_path / "photos", 3)
+    write_album(tmp_path / "one", 1)
+    write_album(tmp_path / "other-photos", 3, first=3)
+    write_album(tmp_path / "unseen", 3, first=6)
     monkeypatch.chdir(tmp_path)
     assert cli.main(shlex.split("run --defense none --attack keypoints --images photos/ --out runs/x")) == 0
     for name in ("baseline.jsonl", "theirs.jsonl"):
@@ -90,7 +90,7 @@ def test_commands_run(page: str, place: Path, capfd: pytest.CaptureFixture[str])
 def arguments(command: str) -> list[str]:
     """What is run for a command of a document."""
     words = shlex.split(command)
-    args, extra = parser().parse_known_args(words)
+    args, extra = build_parser().parse_known_args(words)
     assert not extra
     assert all(getattr(args, option) for option in args.required)
     if command in ELSEWHERE:

@@ -12,10 +12,10 @@ import bench
 from bench import cli
 from bench.audit.bounds import log_ratio
 from bench.codebook.dictionary import Dictionary
-from bench.codebook.examples import example_features
+from bench.codebook.examples import draw_features
 from bench.codebook.public import Public
-from bench.mechanisms.composition import epsilon_left
-from bench.mechanisms.subset import information, log10_chance, most_accurate_size, most_informative_size
+from bench.mechanisms.composition import solve_epsilon
+from bench.mechanisms.subset import log10_chance, most_accurate_size, most_informative_size, mutual_information
 from defenses.ldp import LDP
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "guarantee.md").read_text(encoding="utf-8")
@@ -42,7 +42,7 @@ def test_commands_run(command: str, capfd: pytest.CaptureFixture[str]) -> None:
 def test_the_line_of_python_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (line,) = re.findall(r"```python\n(.*?)\n```", PAGE, re.DOTALL)
     monkeypatch.chdir(tmp_path)
-    found: dict[str, object] = {"bench": bench, "LDP": LDP, "features": example_features(20)}
+    found: dict[str, object] = {"bench": bench, "LDP": LDP, "features": draw_features(20)}
     exec(line, found)
     assert len(found["release"]) == 20  # type: ignore[arg-type]
     assert (tmp_path / "device.key").is_file()
@@ -53,7 +53,7 @@ def test_numbers() -> None:
     words = len(shipped)
     assert words == 256_000
     assert f"{math.exp(10):,.0f} times" in PAGE
-    left = epsilon_left(10.0, 1000)
+    left = solve_epsilon(10.0, 1000)
     assert f"About {left:.3f}: then" in PAGE
     one_in = 2 / 10 ** log10_chance(left, words, 2)
     assert f"one released word in {round(one_in, -3):,.0f} is the true one" in PAGE
@@ -75,7 +75,7 @@ def test_what_sets_of_each_size_tell() -> None:
     ]
     for size, told, bits in rows:
         assert f"{10 ** log10_chance(6.534, 8000, int(size)):.3f}" == told
-        assert f"{information(6.534, 8000, np.array([int(size)]))[0] / math.log(2):.2f}" == bits
+        assert f"{mutual_information(6.534, 8000, np.array([int(size)]))[0] / math.log(2):.2f}" == bits
 
 
 def test_how_much_trials_can_show() -> None:

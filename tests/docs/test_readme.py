@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.cli import parser
+from bench.cli import build_parser
 from bench.codebook import examples
 from bench.codebook.public import Public
 from bench.registry import discovery
@@ -21,7 +21,7 @@ def test_the_defense_in_twenty_lines(tmp_path, monkeypatch):
     import rounding
 
     plugin = discovery.check(discovery.DEFENSE, rounding.PLUGIN)
-    secret = examples.example_features(20, 0)
+    secret = examples.draw_features(20, 0)
     release = plugin(levels=4).protect(secret, Public(), np.random.default_rng(0))
     assert set(np.unique(release.descriptors * 4)) <= {0, 1, 2, 3, 4}
     assert plugin.name() == "rounding"
@@ -29,6 +29,6 @@ def test_the_defense_in_twenty_lines(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("line", re.findall(r"^(?:\.venv/bin/)?bench (.+?)(?:\s+#.*)?$", README, re.MULTILINE))
 def test_commands_are_understood(line):
-    args, extra = parser().parse_known_args(line.split())
+    args, extra = build_parser().parse_known_args(line.split())
     assert not extra
     assert all(getattr(args, option) for option in args.required)

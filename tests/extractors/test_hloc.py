@@ -6,7 +6,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from fakes import texture
+from fakes import draw_texture
 from PIL import Image
 
 from attacks.lattice import Lattice
@@ -27,7 +27,7 @@ KEYPOINTS = np.array([[100.0, 0.0], [299.0, 199.0], [199.5, 99.5], [10.0, 10.0],
 def photograph(tmp_path: Path) -> Path:
     path = tmp_path / "db" / "street" / "a.png"
     path.parent.mkdir(parents=True)
-    texture(0, (WIDTH, HEIGHT)).save(path)
+    draw_texture(0, (WIDTH, HEIGHT)).save(path)
     return path
 
 
@@ -71,7 +71,7 @@ def test_keypoints_follow_the_cut_and_the_scale(tmp_path: Path, photograph: Path
 
 
 def test_keypoints_agree_with_those_of_the_square(tmp_path: Path) -> None:
-    image = texture(1, (256, 256))
+    image = draw_texture(1, (256, 256))
     image.save(tmp_path / "a.png")
     ours = Sift().extract(np.asarray(image))
     assert ours.codes is not None
@@ -124,7 +124,7 @@ def test_other_lengths_are_asked_for(tmp_path: Path, photograph: Path) -> None:
 def test_rotated_photograph_is_refused(tmp_path: Path) -> None:
     exif = Image.Exif()
     exif[0x0112] = 3
-    texture(0, (WIDTH, HEIGHT)).save(tmp_path / "a.png", exif=exif)
+    draw_texture(0, (WIDTH, HEIGHT)).save(tmp_path / "a.png", exif=exif)
     with pytest.raises(SampleError, match="EXIF rotation"):
         extract(features(tmp_path, "a.png"), tmp_path / "a.png")
 

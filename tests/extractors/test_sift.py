@@ -11,7 +11,7 @@ from bench.images import photographs
 
 @pytest.fixture(scope="module")
 def images():
-    return [photographs.read(source.path).pixels for source in photographs.builtin()]
+    return [photographs.read(source.path).pixels for source in photographs.list_builtin()]
 
 
 def matched(one: np.ndarray, other: np.ndarray) -> float:

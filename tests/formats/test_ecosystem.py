@@ -9,19 +9,19 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
-from fakes import album, texture
+from fakes import draw_texture, write_album
 from PIL import Image
 
 from bench import cli
-from bench.codebook.examples import small_dictionary
+from bench.codebook.examples import write_dictionary
 from bench.core.errors import SampleError, UserError
 from bench.extractors.colmap_database import ColmapDatabase
 from bench.extractors.hardnet import WEIGHTS, HardNet
 from bench.extractors.hloc import Hloc
 from bench.extractors.sift import Sift
-from bench.formats.stored_features import in_square, out_of_square
+from bench.formats import pairs as hloc_pairs
+from bench.formats.stored_features import map_into_square, map_out_of_square
 from bench.images import photographs
-from bench.runner import feature_export
 from bench.testing import check_extractor
 
 kornia = pytest.importorskip("kornia")
@@ -33,7 +33,7 @@ def images(tmp_path: Path) -> Path:
     root = tmp_path / "photos"
     for number, name in enumerate(("street/a.png", "b.png")):
         (root / name).parent.mkdir(parents=True, exist_ok=True)
-        texture(number, (300 + number, 200)).save(root / name)
+        draw_texture(number, (300 + number, 200)).save(root / name)
     return root
 
 
@@ -47,7 +47,7 @@ def export(*arguments: object) -> int:
 def test_into_the_square_and_out_again(rng: np.random.Generator) -> None:
     points = rng.uniform(0, 300, (20, 2))
     for size in ((300, 200), (201, 300), (64, 64)):
-        np.testing.assert_allclose(out_of_square(in_square(points, size, 256), size, 256), points)
+        np.testing.assert_allclose(map_out_of_square(map_into_square(points, size, 256), size, 256), points)
 
 
 # ---- hloc
@@ -67,13 +67,13 @@ def test_features_for_hloc_are_those_that_come_back(images: Path, tmp_path: Path
         assert group["image_size"][()].tolist() == [300, 200]
         xy = group["keypoints"][()]  # of the photograph, the centre of the first pixel at (0, 0)
     np.testing.assert_allclose(xy, ours.keypoints * (200 / 256) + [50, 0] - 0.5, atol=1e-3)
-    assert feature_export.read_pairs(pairs) == [("b.png", "street/a.png")]
+    assert hloc_pairs.read(pairs) == {"b.png": ["street/a.png"]}
 
 
 def test_of_a_set_each_word_is_written_and_of_a_subspace_what_is_recovered(
     images: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    ldp = f"ldp:epsilon=inf,subset_size=3,dictionary={small_dictionary(tmp_path)}"
+    ldp = f"ldp:epsilon=inf,subset_size=3,dictionary={write_dictionary(tmp_path)}"
     out = tmp_path / "sets.h5"
     assert export("--images", images, "--defense", ldp, "--layout", "hloc", "--out", out) == 0
     count = len(Sift().extract(photographs.read(images / "b.png").pixels))
@@ -81,10 +81,10 @@ def test_of_a_set_each_word_is_written_and_of_a_subspace_what_is_recovered(
         xy = opened["b.png"]["keypoints"][()]
     assert len(xy) == 3 * count
     assert np.array_equal(xy[0::3], xy[1::3])
-    affine = f"affine:dim=2,sub_databases=1,database={small_dictionary(tmp_path)}"
+    affine = f"affine:dim=2,sub_databases=1,database={write_dictionary(tmp_path)}"
     assert export("--images", images, "--defense", affine, "--layout", "hloc", "--out", tmp_path / "x.h5") == 2
-    assert "a release of Subspaces has no descriptors; --attack exports what is recovered" in capfd.readouterr().err
-    nearest = f"nearest:database={small_dictionary(tmp_path, seed=2)}"
+    assert "a release of Subspaces has no descriptors; give --attack to export recovered ones" in capfd.readouterr().err
+    nearest = f"nearest:database={write_dictionary(tmp_path, seed=2)}"
     recovered = tmp_path / "recovered.h5"
     assert export("--images", images, "--defense", affine, "--attack", nearest, "--layout", "hloc", "--out", recovered) == 0
     with h5py.File(recovered) as opened:
@@ -95,21 +95,13 @@ def test_of_a_set_each_word_is_written_and_of_a_subspace_what_is_recovered(
 
 def test_mistakes_of_export(images: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     for arguments, complaint in (
-        (("--layout", "hlco", "--out", tmp_path / "x"), "--layout hlco: there is hloc and colmap"),
+        (("--layout", "hlco", "--out", tmp_path / "x"), "--layout hlco: unknown layout; available: hloc, colmap"),
         (("--layout", "hloc", "--out", images / "b.png"), "exists already"),
         (("--layout", "hloc", "--out", tmp_path / "x", "--attack", "nearest"), "nearest attacks Subspaces"),
     ):
         assert export("--images", images, *arguments) == 2
         assert complaint in capfd.readouterr().err
     assert not (tmp_path / "x").exists()
-
-
-def test_lists_of_pairs(tmp_path: Path) -> None:
-    (tmp_path / "pairs.txt").write_text("a.png b.png\n\nc.png\n")
-    with pytest.raises(UserError, match=r"pairs.txt:3: a pair has two names, but there are 1"):
-        feature_export.read_pairs(tmp_path / "pairs.txt")
-    with pytest.raises(UserError, match="space"):
-        feature_export.write_pairs(tmp_path / "new.txt", ["a b.png", "c.png"])
 
 
 # ---- COLMAP
@@ -138,8 +130,8 @@ def test_database_for_colmap_is_read_by_colmap_and_by_us(images: Path, tmp_path:
 
 def test_what_colmap_extracted_is_read(tmp_path: Path) -> None:
     """An independent writer: COLMAP's own SIFT."""
-    root = album(tmp_path / "photos", 1)
-    texture(5, (256, 256)).save(root / "0.png")
+    root = write_album(tmp_path / "photos", 1)
+    draw_texture(5, (256, 256)).save(root / "0.png")
     out = tmp_path / "database.db"
     pycolmap.extract_features(out, root, device=pycolmap.Device.cpu)
     path = root / "0.png"
@@ -159,10 +151,10 @@ def test_databases_that_cannot_serve(images: Path, tmp_path: Path) -> None:
     out = tmp_path / "database.db"
     assert export("--images", images, "--layout", "colmap", "--out", out) == 0
     stranger = tmp_path / "stranger.png"
-    texture(9, (300, 200)).save(stranger)
+    draw_texture(9, (300, 200)).save(stranger)
     with pytest.raises(SampleError, match="no image of that name"):
         ColmapDatabase(path=out).extract(photographs.read(stranger).pixels, stranger)
-    texture(9, (100, 200)).save(images / "b.png")
+    draw_texture(9, (100, 200)).save(images / "b.png")
     with pytest.raises(SampleError, match="the photograph has"):
         ColmapDatabase(path=out).extract(photographs.read(images / "b.png").pixels, images / "b.png")
     with pytest.raises(UserError, match="this one has none"):
@@ -176,8 +168,8 @@ def test_of_megadepth_the_photographs_are_taken(tmp_path: Path) -> None:
     scene = tmp_path / "phoenix" / "S6" / "zl548" / "MegaDepth_v1" / "0000"
     for name in ("dense0/imgs/a.jpg", "dense1/imgs/b.jpg", "dense0/depths/a.png"):
         (scene / name).parent.mkdir(parents=True, exist_ok=True)
-        texture(0).save(scene / name)
-    found = photographs.folder(tmp_path / "phoenix")
+        draw_texture(0).save(scene / name)
+    found = photographs.list_photographs(tmp_path / "phoenix")
     assert [source.path.name for source in found] == ["a.jpg", "b.jpg"]
     assert found[0].name == "S6/zl548/MegaDepth_v1/0000/dense0/imgs/a.jpg"
 
@@ -186,9 +178,9 @@ def test_of_hpatches_every_image_is_taken(tmp_path: Path) -> None:
     for sequence in ("i_dome", "v_wall"):
         (tmp_path / sequence).mkdir()
         for number in range(1, 7):
-            texture(number).save(tmp_path / sequence / f"{number}.ppm")
+            draw_texture(number).save(tmp_path / sequence / f"{number}.ppm")
         (tmp_path / sequence / "H_1_2").write_text("1 0 0\n0 1 0\n0 0 1\n")
-    found = photographs.folder(tmp_path)
+    found = photographs.list_photographs(tmp_path)
     assert len(found) == 12
     assert photographs.read(found[0].path).pixels.shape == (256, 256, 3)
 
@@ -207,7 +199,7 @@ def weights(tmp_path: Path) -> Path:
 
 
 def test_hardnet_keeps_the_contract_and_describes_as_kornia_does(weights: Path) -> None:
-    image = np.asarray(texture(0, (256, 256)))
+    image = np.asarray(draw_texture(0, (256, 256)))
     extractor = HardNet(weights=weights, max_keypoints=20)
     check_extractor(extractor, image)
     found = extractor.extract(image)
@@ -241,9 +233,9 @@ def test_hardnet_without_weights_or_kornia(weights: Path, tmp_path: Path, monkey
         HardNet(weights=tmp_path / "absent.pth")
     (tmp_path / "other.pth").write_bytes(b"something else")
     with pytest.raises(UserError, match="not kornia's"):
-        HardNet(weights=tmp_path / "other.pth").extract(np.asarray(texture(0, (256, 256))))
+        HardNet(weights=tmp_path / "other.pth").extract(np.asarray(draw_texture(0, (256, 256))))
     without(monkeypatch, "kornia")
-    texture(0).save(tmp_path / "a.png")
+    draw_texture(0).save(tmp_path / "a.png")
     moved = weights.rename(tmp_path / "moved.pth")
     with pytest.raises(UserError, match="hardnet needs kornia: pip install"):
         HardNet(weights=moved).extract(np.asarray(Image.open(tmp_path / "a.png")))
@@ -270,19 +262,19 @@ def test_training_tells_tensorboard(tmp_path: Path) -> None:
 
     log = Log(tmp_path / "log")
     for step in range(1, 4):
-        log.scalars({"loss": 1 / step, "rate": 0.5}, step)
+        log.add_scalars({"loss": 1 / step, "rate": 0.5}, step)
     log.close()
     read = events.EventAccumulator(str(tmp_path / "log"))
     read.Reload()
     assert [(event.step, event.value) for event in read.Scalars("loss")] == [(1, 1.0), (2, 0.5), (3, pytest.approx(1 / 3))]
-    Log(None).scalars({"loss": 1.0}, 1)
+    Log(None).add_scalars({"loss": 1.0}, 1)
 
 
 def test_no_tensorboard_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
     import sys
 
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)  # an import of it fails
-    images = album(tmp_path / "photos", 3)
+    images = write_album(tmp_path / "photos", 3)
     arguments = ["--defense", "none", "--images", str(images), "--out", str(tmp_path / "w"), "--log", str(tmp_path / "log")]
     assert cli.main(["train", *arguments, "--steps", "1"]) == 2
     assert "--log needs tensorboard: pip install" in capfd.readouterr().err

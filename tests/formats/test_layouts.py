@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
-from fakes import scene
+from fakes import write_scene
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -24,7 +24,7 @@ LOADERS: dict[str, Callable[[Path], Scene]] = {"aachen": aachen.load, "colmap": 
 
 @pytest.fixture(scope="module")
 def original(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return scene(tmp_path_factory.mktemp("noise"))
+    return write_scene(tmp_path_factory.mktemp("noise"))
 
 
 @pytest.fixture(scope="module")
@@ -132,7 +132,7 @@ def test_ground_truth_may_be_a_model_a_list_or_absent(original: Scene, here: dic
     (root / "ground_truth.txt").unlink()
     assert all(query.cam_from_world is None for query in colmap.load(root).queries)
     (root / "ground_truth").mkdir()
-    scene_export.model(original.queries).write(root / "ground_truth")
+    scene_export.build_model(original.queries).write(root / "ground_truth")
     assert all(same(one, other) for one, other in zip(original.queries, colmap.load(root).queries, strict=True))
 
 
@@ -180,7 +180,7 @@ LISTED = [
     (1, field(4, "nan"), "not all of these are finite"),
     (1, field(4, "-75"), "the focal length must be above zero"),
     (1, field(5, "four"), "could not convert string to float: 'four'"),
-    (2, field(0, "query/day/0.png"), r"query/day/0\.png stands here for the second time; the first is line 1"),
+    (2, field(0, "query/day/0.png"), r"query/day/0\.png occurs a second time; the first is line 1"),
     (1, field(0, "query/day/absent.png"), r"there is no image .*absent\.png"),
     (1, field(0, "db/0.png"), r"db/0\.png is a reference as well"),
 ]
@@ -190,7 +190,7 @@ POSES = [
     (1, field(5, "inf"), "not all of these are finite"),
     (1, field(1, "2"), "the quaternion .* has norm 2"),
     (3, field(0, "query/day/9.png"), r"a pose of query/day/9\.png, which is no query"),
-    (3, field(0, "query/day/0.png"), "for the second time"),
+    (3, field(0, "query/day/0.png"), "occurs a second time"),
 ]
 
 
@@ -250,7 +250,7 @@ def test_damaged_text_models_are_refused(here: dict[str, Path], file: str, line:
         (4, lambda row: row.rpartition(" ")[0], "a camera has 11 fields, but there are 10"),
         (5, field(3, "nan"), "not all of these are finite"),
         (5, field(2, "1.5"), "the quaternion .* has norm"),
-        (6, field(0, "db/0.png"), r"db/0\.png stands here for the second time; the first is line 4"),
+        (6, field(0, "db/0.png"), r"db/0\.png occurs a second time; the first is line 4"),
         (6, field(0, "db/9.png"), r"db/9\.png has no intrinsics in"),
     ],
 )
@@ -322,7 +322,7 @@ def test_aachen_s_folders_of_both_versions(here: dict[str, Path], original: Scen
     (root / "images_upright").rename(root / "images" / "images_upright")
     later = root / "3D-models" / "aachen_v_1_1"
     later.mkdir()
-    scene_export.model(original.references[:2]).write_text(later)
+    scene_export.build_model(original.references[:2]).write_text(later)
     first = root / "queries" / "night_time_queries_with_intrinsics.txt"
     second = root / "queries" / "night_time_queries_with_intrinsics_v1_1.txt"
     with pytest.raises(UserError, match=r"models of both versions are there; say which, v1 or v1\.1"):
@@ -378,5 +378,5 @@ def test_results_are_written_as_the_server_wants_them(original: Scene, tmp_path:
 def test_nothing_is_written_over(original: Scene, written: dict[str, Path], tmp_path: Path) -> None:
     with pytest.raises(UserError, match="exists already; name a new folder"):
         scene_export.write(original, "colmap", written["colmap"])
-    with pytest.raises(UserError, match="--layout nerf: there is aachen and colmap"):
+    with pytest.raises(UserError, match="--layout nerf: unknown layout; available: aachen, colmap"):
         scene_export.write(original, "nerf", tmp_path / "x")

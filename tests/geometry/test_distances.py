@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 import torch
-from subspace_cases import residual, subspaces
+from subspace_cases import draw_subspaces, residual
 
-from bench.codebook.examples import example_features
-from bench.geometry.distances import mutual, points_to_points, subspaces_to_points, subspaces_to_subspaces
+from bench.codebook.examples import draw_features
+from bench.geometry.distances import find_mutual_nearest, points_to_points, subspaces_to_points, subspaces_to_subspaces
 from bench.geometry.nearest_words import unit_rows
 from bench.types import Floats
 
@@ -14,12 +14,12 @@ D = 128
 
 
 def descriptors(count: int, seed: int = 5) -> Floats:
-    return unit_rows(example_features(count, seed=seed).descriptors)
+    return unit_rows(draw_features(count, seed=seed).descriptors)
 
 
 @pytest.mark.parametrize("dim", [1, 2, 4, 8])
 def test_points_and_subspaces(rng: np.random.Generator, dim: int) -> None:
-    release, points = subspaces(rng, 7, dim), descriptors(9)
+    release, points = draw_subspaces(rng, 7, dim), descriptors(9)
     expected = [[residual(release.bases[n].T, u - release.origins[n]) for u in points] for n in range(len(release))]
     found = subspaces_to_points(release, torch.from_numpy(points)).sqrt().numpy()
     np.testing.assert_allclose(found, expected, atol=1e-4)
@@ -27,7 +27,7 @@ def test_points_and_subspaces(rng: np.random.Generator, dim: int) -> None:
 
 @pytest.mark.parametrize(("dim", "other"), [(2, 2), (4, 2), (8, 8)])
 def test_two_subspaces(rng: np.random.Generator, dim: int, other: int) -> None:
-    one, two = subspaces(rng, 11, dim), subspaces(rng, 600, other)
+    one, two = draw_subspaces(rng, 11, dim), draw_subspaces(rng, 600, other)
     found = subspaces_to_subspaces(one, two).sqrt().numpy()
     assert found.shape == (11, 600)
     for n in range(len(one)):
@@ -52,13 +52,13 @@ def test_mutually_nearest_against_loops(rng: np.random.Generator, ratio: float) 
         second = sorted(squared[row])[1]
         if back == row and (ratio == 1 or np.sqrt(squared[row, column]) < ratio * np.sqrt(second)):
             expected.append((row, column))
-    rows, columns = mutual(torch.from_numpy(squared), ratio)
+    rows, columns = find_mutual_nearest(torch.from_numpy(squared), ratio)
     assert list(zip(rows.tolist(), columns.tolist(), strict=True)) == expected
     assert 0 < len(expected) < 30
 
 
 def test_nothing_is_nearest_to_nothing() -> None:
     for shape in ((0, 3), (3, 0)):
-        rows, columns = mutual(torch.zeros(shape))
+        rows, columns = find_mutual_nearest(torch.zeros(shape))
         assert len(rows) == len(columns) == 0
-    assert mutual(torch.ones(1, 1), 0.8)[0].tolist() == [0]  # one column has no second
+    assert find_mutual_nearest(torch.ones(1, 1), 0.8)[0].tolist() == [0]  # one column has no second

@@ -3,29 +3,29 @@
 import numpy as np
 import pytest
 
-from bench.api import Asset
 from bench.codebook import dictionary
-from bench.codebook.examples import example_features, small_dictionary
+from bench.codebook.examples import draw_features, write_dictionary
 from bench.codebook.public import Public
-from bench.geometry.database_reconstruction import bytes_of, rebuilt
-from bench.geometry.intersections import MEETS, meetings, meetings_within, nearest_points
+from bench.geometry.database_reconstruction import find_byte_vectors, reconstruct_database
+from bench.geometry.intersections import INTERSECTION_DISTANCE, find_intersections, find_intersections_within, find_nearest_points
 from bench.geometry.nearest_words import unit_rows
-from bench.geometry.shared_sub_database import stacked
+from bench.geometry.shared_sub_database import stack_subspaces
+from bench.settings import Asset
 from bench.types import Subspaces
 from defenses.affine import Affine
 
 
 @pytest.fixture
 def database(tmp_path):
-    return small_dictionary(tmp_path, 24)
+    return write_dictionary(tmp_path, 24)
 
 
-def released(database: Asset, dim: int, seed: int, count: int = 12) -> Subspaces:
+def release_features(database: Asset, dim: int, seed: int, count: int = 12) -> Subspaces:
     defense = Affine(dim=dim, sub_databases=1, database=database)
-    return defense.protect(example_features(count, seed), Public(), np.random.default_rng(seed))
+    return defense.protect(draw_features(count, seed), Public(), np.random.default_rng(seed))
 
 
-def apart(one: Subspaces, i: int, other: Subspaces, j: int) -> float:
+def measure_distance(one: Subspaces, i: int, other: Subspaces, j: int) -> float:
     """The distance of two subspaces, by least squares over the directions of both."""
     directions = np.concatenate([one.bases[i], other.bases[j]]).astype(np.float64).T  # (D, dim + dim')
     between = (other.origins[j] - one.origins[i].astype(np.float64))[:, None]
@@ -34,41 +34,43 @@ def apart(one: Subspaces, i: int, other: Subspaces, j: int) -> float:
 
 @pytest.mark.parametrize("dim", [2, 4, 16])
 def test_finds_the_pairs_that_least_squares_finds(database, dim):
-    one, other = released(database, dim, 1), released(database, dim, 2, 9)
-    distances = np.array([[apart(one, i, other, j) for j in range(9)] for i in range(12)])
-    expected = {(int(i), int(j)) for i, j in np.argwhere(distances < MEETS)}
-    found = meetings(one, other)
+    one, other = release_features(database, dim, 1), release_features(database, dim, 2, 9)
+    distances = np.array([[measure_distance(one, i, other, j) for j in range(9)] for i in range(12)])
+    expected = {(int(i), int(j)) for i, j in np.argwhere(distances < INTERSECTION_DISTANCE)}
+    found = find_intersections(one, other)
     assert set(zip(found.first.tolist(), found.second.tolist(), strict=True)) == expected
     assert 0 < len(expected) < 12 * 9
-    assert distances[distances > MEETS].min() > 100 * MEETS  # zero is told from small with room to spare
+    assert (
+        distances[distances > INTERSECTION_DISTANCE].min() > 100 * INTERSECTION_DISTANCE
+    )  # zero is told from small with room to spare
 
 
 def test_subspaces_of_other_databases_do_not_meet(database, tmp_path):
     """Negative control."""
-    strange = small_dictionary(tmp_path, 24, seed=9)
-    assert len(meetings(released(database, 4, 1), released(strange, 4, 2))) == 0
+    strange = write_dictionary(tmp_path, 24, seed=9)
+    assert len(find_intersections(release_features(database, 4, 1), release_features(strange, 4, 2))) == 0
 
 
 def test_pairs_within_a_release_come_once(database):
-    release = released(database, 4, 1)
-    within, both = meetings_within(release), meetings(release, release)
+    release = release_features(database, 4, 1)
+    within, both = find_intersections_within(release), find_intersections(release, release)
     pairs = {(i, j) for i, j in zip(both.first.tolist(), both.second.tolist(), strict=True) if i < j}
     assert set(zip(within.first.tolist(), within.second.tolist(), strict=True)) == pairs
     assert (within.first < within.second).all()
 
 
 def test_two_liftings_of_one_descriptor_meet_in_it(database):
-    defense, secret = Affine(dim=6, sub_databases=1, database=database), example_features(30, 3)
+    defense, secret = Affine(dim=6, sub_databases=1, database=database), draw_features(30, 3)
     one, other = (defense.protect(secret, Public(), np.random.default_rng(seed)) for seed in (1, 2))
-    points, distances, single = nearest_points(one, other)
-    assert (distances < MEETS).all()
+    points, distances, single = find_nearest_points(one, other)
+    assert (distances < INTERSECTION_DISTANCE).all()
     assert single.mean() > 0.5  # some share a word, too, and then a line
     np.testing.assert_allclose(points[single], secret.descriptors[single], atol=1e-5)
 
 
 def test_words_are_rebuilt_to_the_last_bit(database):
     words = Public().dictionary(database).words
-    found = rebuilt(meetings_within(released(database, 4, 1, 60)))
+    found = reconstruct_database(find_intersections_within(release_features(database, 4, 1, 60)))
     known = {row.tobytes() for row in words // np.gcd.reduce(words.astype(np.int64), axis=1)[:, None].astype(np.uint8)}
     assert len(found) > 20
     assert all(row.tobytes() in known for row in found)
@@ -76,15 +78,15 @@ def test_words_are_rebuilt_to_the_last_bit(database):
 
 def test_points_that_are_no_words_are_left_out(rng):
     """Negative control: noise of a hundredth of a unit is no 8-bit vector."""
-    codes = example_features(20).codes
+    codes = draw_features(20).codes
     points = unit_rows(codes).astype(np.float64)
-    assert len(bytes_of(points)) == 20
-    assert len(bytes_of(points + rng.normal(0, 1e-3, points.shape))) == 0
+    assert len(find_byte_vectors(points)) == 20
+    assert len(find_byte_vectors(points + rng.normal(0, 1e-3, points.shape))) == 0
 
 
 def test_more_words_are_rebuilt_from_more_photographs(tmp_path):
     path = tmp_path / "W.safetensors"
-    dictionary.save(path, example_features(400, 5).codes, {"photographs": []})
-    parts = [released(Asset(path), 4, seed, 30) for seed in range(8)]
-    counts = [len(rebuilt(meetings_within(stacked(parts[:number])))) for number in (1, 4, 8)]
+    dictionary.save(path, draw_features(400, 5).codes, {"photographs": []})
+    parts = [release_features(Asset(path), 4, seed, 30) for seed in range(8)]
+    counts = [len(reconstruct_database(find_intersections_within(stack_subspaces(parts[:number])))) for number in (1, 4, 8)]
     assert counts[0] < counts[1] < counts[2] <= 400

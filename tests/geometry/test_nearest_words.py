@@ -6,14 +6,14 @@ import faiss
 import numpy as np
 import pytest
 import torch
-from floor import bare_product
+from floor import build_bare_product
 
 from bench.geometry import nearest_words
 from bench.geometry.nearest_words import WordIndex, unit_rows
 
 
 def nearest_rows(queries: np.ndarray, words: np.ndarray) -> np.ndarray:
-    return WordIndex(words).nearest(queries)
+    return WordIndex(words).find_nearest(queries)
 
 
 def brute_force(queries: np.ndarray, words: np.ndarray) -> np.ndarray:
@@ -98,7 +98,7 @@ def flat(words: np.ndarray) -> faiss.IndexFlatIP:
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=["float32", "bf16"])
 def test_speed_of_the_bare_product(benchmark, many, dtype):
     queries, words = many
-    benchmark(bare_product(len(queries), words, dtype))
+    benchmark(build_bare_product(len(queries), words, dtype))
 
 
 @speed
@@ -110,6 +110,6 @@ def test_speed_of_faiss_flat(benchmark, many):
 @speed
 def test_speed_of_the_search(benchmark, many):
     queries, words = many
-    benchmark(WordIndex(words).nearest, queries)
+    benchmark(WordIndex(words).find_nearest, queries)
     index, rows = flat(words), unit_rows(queries)
     assert benchmark.stats.stats.min < min(timeit.repeat(lambda: index.search(rows, 1), number=1, repeat=5))

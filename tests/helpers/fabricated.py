@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from bench.runner.records import FILE, SCHEMA, experiment_id, run_hash
+from bench.runner.records import FILE, SCHEMA, experiment_id, run_hash, seal
 
 SIFT = {"name": "sift", "upright": True, "max_keypoints": 1000}
 ENVIRONMENT = {"version": "0.1.0", "source": "sha256:" + "5" * 64, "torch": "2.14", "device": "cpu", "threads": 2}
@@ -44,38 +44,41 @@ def record(
     cell = experiment_id({"name": task, **task_settings}, defense, attack, dataset, seed, settings)
     epsilon = defense.get("epsilon")
     keypoints = metrics.get("keypoints", 100) if status == "ok" else None
-    return {
-        "schema": SCHEMA,
-        "task": task,
-        "defense": defense,
-        "attack": attack,
-        "dataset": dataset,
-        "task_settings": dict(task_settings),
-        "metric_settings": settings,
-        "seed": seed,
-        "cell_id": cell,
-        "run_hash": run_hash(cell, environment),
-        "environment": environment,
-        "unit": unit,
-        "status": status,
-        "reason": reason,
-        "metrics": metrics,
-        "privacy": {
-            "guarantee": "none" if epsilon is None else "epsilon-ldp",
-            "epsilon_descriptor": epsilon,
-            "keypoints": keypoints,
-            "releases": 1,
-            "epsilon_image": epsilon and keypoints and epsilon * keypoints,
-            "epsilon_image_optimal": epsilon and keypoints and epsilon * keypoints * 0.9,
-            "delta": 1e-6,
-            "uncovered": UNCOVERED,
-            "log10_true": None if epsilon is None else -1.0,
-            "seeded": True,
-            "private": False,
-        },
-        "seconds": 0.5,
-        "notes": [],
-    } | more
+    return seal(
+        {
+            "schema": SCHEMA,
+            "task": task,
+            "defense": defense,
+            "attack": attack,
+            "dataset": dataset,
+            "task_settings": dict(task_settings),
+            "metric_settings": settings,
+            "seed": seed,
+            "experiment_id": cell,
+            "run_hash": run_hash(cell, environment),
+            "environment": environment,
+            "sample": unit,
+            "status": status,
+            "reason": reason,
+            "metrics": metrics,
+            "privacy": {
+                "guarantee": "none" if epsilon is None else "epsilon-ldp",
+                "epsilon_descriptor": epsilon,
+                "keypoints": keypoints,
+                "releases": 1,
+                "epsilon_image": epsilon and keypoints and epsilon * keypoints,
+                "epsilon_image_optimal": epsilon and keypoints and epsilon * keypoints * 0.9,
+                "delta": 1e-6,
+                "uncovered": UNCOVERED,
+                "log10_true": None if epsilon is None else -1.0,
+                "seeded": True,
+                "private": False,
+            },
+            "seconds": 0.5,
+            "notes": [],
+        }
+        | more
+    )
 
 
 def reconstructions(defense: dict[str, Any], scores: Sequence[float], **more: Any) -> list[dict[str, Any]]:
@@ -108,11 +111,11 @@ def write(folder: Path, records: Sequence[dict[str, Any]]) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / FILE).open("w") as file:
         for one in records:
-            file.write(json.dumps(one, allow_nan=False) + "\n")
+            file.write(json.dumps(seal(one), allow_nan=False) + "\n")
     return folder
 
 
-def paint(path: Path, seed: int) -> Path:
+def draw_picture(path: Path, seed: int) -> Path:
     """A smooth picture."""
     path.parent.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng(seed)

@@ -1,7 +1,9 @@
 """Plugins and photographs that are made up for tests."""
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -9,10 +11,15 @@ import pytest
 from PIL import Image, ImageFilter
 from scipy.spatial.transform import Rotation
 
-from bench.api import Defense, Trial
+from bench.api import Attack, Defense
 from bench.codebook.public import Public
+from bench.core import environment
 from bench.extractors.sift import Sift
+from bench.images.samples import Images
 from bench.images.scene import File, Reference, Scene, SceneImage
+from bench.runner.plan import Describe, Plan, RunConfiguration, build_plan, cross
+from bench.runner.trial import dry_run
+from bench.task_api import Task, Trial
 from bench.testing import NO_SAMPLE, shot
 from bench.types import Features, Release
 
@@ -27,7 +34,9 @@ FAKES = {
 }
 
 
-def install(folder: Path, monkeypatch: pytest.MonkeyPatch, groups: dict[str, dict[str, str]], name: str = "made-up") -> None:
+def install_plugins(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, groups: dict[str, dict[str, str]], name: str = "made-up"
+) -> None:
     """Make a distribution with these entry points, as if it had been installed."""
     info = folder / f"{name.replace('-', '_')}-1.0.dist-info"
     info.mkdir(parents=True)
@@ -37,28 +46,28 @@ def install(folder: Path, monkeypatch: pytest.MonkeyPatch, groups: dict[str, dic
     monkeypatch.syspath_prepend(folder)
 
 
-def texture(seed: int, size: tuple[int, int] = (80, 64)) -> Image.Image:
+def draw_texture(seed: int, size: tuple[int, int] = (80, 64)) -> Image.Image:
     """A blurred random picture, in which SIFT finds keypoints. `size` is width, height."""
     noise = np.random.default_rng(seed).integers(0, 256, (size[1], size[0], 3), dtype=np.uint8)
     return Image.fromarray(noise).filter(ImageFilter.GaussianBlur(2))
 
 
-def album(folder: Path, count: int = 2, first: int = 0) -> Path:
+def write_album(folder: Path, count: int = 2, first: int = 0) -> Path:
     """A folder of photographs; those with other numbers are others."""
     folder.mkdir(parents=True, exist_ok=True)
     for number in range(first, first + count):
-        texture(number).save(folder / f"{number}.png")
+        draw_texture(number).save(folder / f"{number}.png")
     return folder
 
 
-def scene(folder: Path, references: int = 3, queries: int = 4) -> Scene:
+def write_scene(folder: Path, references: int = 3, queries: int = 4) -> Scene:
     """Blurred noise by cameras at random places; the second half of the queries is by night."""
     rng = np.random.default_rng(7)
 
     def image(name: str, focal: float) -> dict:
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        texture(int(rng.integers(1000))).save(path)
+        draw_texture(int(rng.integers(1000))).save(path)
         camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", focal, 80, 64)
         camera.params = [focal, 40.25, 31.5, 0.0123456789012345]
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(Rotation.random(random_state=rng).as_quat()), rng.normal(0, 20, 3))
@@ -74,7 +83,9 @@ def scene(folder: Path, references: int = 3, queries: int = 4) -> Scene:
     )
 
 
-def trial(defense: Defense, secret: Features, *, rng: np.random.Generator | None = None, others: Sequence[Release] = ()) -> Trial:
+def build_trial(
+    defense: Defense, secret: Features, *, rng: np.random.Generator | None = None, others: Sequence[Release] = ()
+) -> Trial:
     """A trial of a task that judges the release itself, of features without a photograph."""
     public = Public()
     return Trial(
@@ -89,3 +100,19 @@ def trial(defense: Defense, secret: Features, *, rng: np.random.Generator | None
         others=lambda count: iter(others[:count]),
         repeats=(),
     )
+
+
+def prepare_plan(
+    defenses: Sequence[Defense], attacks: Sequence[Attack], images: Images, task: Task, describe: Describe = environment.describe, **more: Any
+) -> Plan:
+    """Build a plan of every pair and dry-run it, as `bench run` does."""
+    configuration = RunConfiguration(
+        pairs=cross(task, defenses, attacks), images=images, task=task, extractor=Sift(), dataset=None, seed=0
+    )
+    return check_plan(build_plan(dataclasses.replace(configuration, **more), describe))
+
+
+def check_plan(plan: Plan) -> Plan:
+    """Dry-run a plan and return it."""
+    dry_run(plan)
+    return plan

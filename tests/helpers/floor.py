@@ -8,7 +8,7 @@ import torch
 from bench.geometry.nearest_words import BLOCK, unit_rows
 
 
-def bare_product(rows: int, words: np.ndarray, dtype: torch.dtype) -> Callable[[], None]:
+def build_bare_product(rows: int, words: np.ndarray, dtype: torch.dtype) -> Callable[[], None]:
     """Multiplies (rows, D) numbers by (K, D) words in blocks that stay in the cache."""
     factor = torch.randn(rows, words.shape[1]).to(dtype)
     blocks = torch.from_numpy(unit_rows(words)).to(dtype).split(BLOCK)

@@ -3,19 +3,21 @@
 import numpy as np
 from scipy.linalg import lstsq
 
-from bench.codebook.examples import example_features
-from bench.types import Subspaces
+from bench.codebook.examples import draw_features
+from bench.types import Points, Subspaces
 
 D = 128
 
 
-def subspaces(rng: np.random.Generator, count: int, dim: int) -> Subspaces:
+def draw_subspaces(rng: np.random.Generator, count: int, dim: int) -> Subspaces:
     """Each through a descriptor, about as lifting makes them."""
-    points = example_features(count, seed=int(rng.integers(1000))).descriptors.astype(np.float64)
+    points = draw_features(count, seed=int(rng.integers(1000))).descriptors.astype(np.float64)
     bases = np.linalg.qr(rng.normal(size=(count, D, dim)))[0].transpose(0, 2, 1)
     origins = points + (rng.normal(size=(count, 1, dim)) @ bases)[:, 0]
     keypoints = np.zeros((count, 2), dtype=np.float32)
-    return Subspaces(keypoints=keypoints, size=(1, 1), origins=origins.astype(np.float32), bases=bases.astype(np.float32))
+    return Subspaces(
+        positions=Points(keypoints=keypoints), size=(1, 1), origins=origins.astype(np.float32), bases=bases.astype(np.float32)
+    )
 
 
 def residual(columns: np.ndarray, target: np.ndarray) -> float:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fakes import album, texture
+from fakes import draw_texture, write_album
 from PIL import Image
 
 from bench.core.errors import SampleError, UserError
@@ -18,7 +18,7 @@ def save(path: Path, image: Image.Image, **options: object) -> Path:
 
 
 def test_built_in_photographs_are_there() -> None:
-    sources = photographs.builtin()
+    sources = photographs.list_builtin()
     assert [source.name for source in sources] == [
         "astronaut",
         "chelsea",
@@ -36,17 +36,17 @@ def test_built_in_photographs_are_there() -> None:
 
 
 def test_folder_is_sorted_and_finds_subfolders(tmp_path: Path) -> None:
-    texture(0).save(tmp_path / "b.JPG")
-    album(tmp_path / "a", 1)
+    draw_texture(0).save(tmp_path / "b.JPG")
+    write_album(tmp_path / "a", 1)
     (tmp_path / "notes.txt").write_text("no photograph")
-    assert [source.name for source in photographs.folder(tmp_path)] == ["a/0.png", "b.JPG"]
+    assert [source.name for source in photographs.list_photographs(tmp_path)] == ["a/0.png", "b.JPG"]
 
 
 def test_empty_and_missing_folders(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"no photograph in it \(looked for \.jpeg, \.jpg, \.png, \.ppm, \.webp\)"):
-        photographs.folder(tmp_path)
+        photographs.list_photographs(tmp_path)
     with pytest.raises(UserError, match="no such folder"):
-        photographs.folder(tmp_path / "absent")
+        photographs.list_photographs(tmp_path / "absent")
 
 
 def test_square_is_cut_from_the_centre(tmp_path: Path) -> None:
@@ -57,7 +57,7 @@ def test_square_is_cut_from_the_centre(tmp_path: Path) -> None:
 
 
 def test_truncated_jpeg(tmp_path: Path) -> None:
-    path = save(tmp_path / "cut.jpg", texture(0))
+    path = save(tmp_path / "cut.jpg", draw_texture(0))
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     with pytest.raises(SampleError, match=r"cut\.jpg: cannot be read as an image: (?i:.*truncated)"):
         photographs.read(path)
@@ -83,7 +83,7 @@ def test_image_without_a_keypoint(tmp_path: Path) -> None:
 
 
 def test_grey_is_read_as_three_equal_channels_with_a_note(tmp_path: Path) -> None:
-    found = photographs.read(save(tmp_path / "grey.png", texture(0).convert("L")))
+    found = photographs.read(save(tmp_path / "grey.png", draw_texture(0).convert("L")))
     assert (found.pixels[..., 0] == found.pixels[..., 2]).all()
     assert "grey" in found.notes[0]
 
@@ -125,16 +125,16 @@ def test_palette_without_transparency(tmp_path: Path) -> None:
 
 
 def test_part_is_held_out_for_validation(tmp_path: Path) -> None:
-    sources = photographs.folder(album(tmp_path / "all", 4))
+    sources = photographs.list_photographs(write_album(tmp_path / "all", 4))
     names = tmp_path / "names.txt"
     names.write_text("1.png\n3.png\n")
-    training, validation = photographs.held_out(sources, names)
+    training, validation = photographs.split_validation(sources, names)
     assert [source.name for source in training] == ["0.png", "2.png"]
     assert [source.name for source in validation] == ["1.png", "3.png"]
-    assert [source.name for source in photographs.held_out(sources, None)[1]] == ["0.png"]
-    assert photographs.held_out(sources, album(tmp_path / "others", 1))[0] == sources
+    assert [source.name for source in photographs.split_validation(sources, None)[1]] == ["0.png"]
+    assert photographs.split_validation(sources, write_album(tmp_path / "others", 1))[0] == sources
     names.write_text("absent.png")
     with pytest.raises(UserError, match="names none"):
-        photographs.held_out(sources, names)
+        photographs.split_validation(sources, names)
     with pytest.raises(UserError, match="no such folder or file"):
-        photographs.held_out(sources, tmp_path / "absent")
+        photographs.split_validation(sources, tmp_path / "absent")

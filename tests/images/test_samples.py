@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fakes import scene, texture
+from fakes import draw_texture, write_scene
 
 from bench.cache import feature_cache, store
 from bench.codebook.public import Public
@@ -14,7 +14,7 @@ from bench.datasets.gallery import Gallery
 from bench.extractors.sift import Sift
 from bench.images import samples
 from bench.images.scene import Pixels, Scene
-from bench.localization.scene_index import Place
+from bench.localization.scene_index import SceneIndex
 from bench.tasks.collisions import Collisions
 from bench.testing import same
 
@@ -31,7 +31,7 @@ def test_queries_are_units_with_their_condition_and_the_whole_scene_counts() -> 
     assert [unit.condition for unit in collection.samples] == ["day", "day", "night"]
     assert len({unit.content_hash() for unit in collection.samples}) == 3
     other = samples.collect_queries(dataclasses.replace(TINY, views=3))  # another map, and so another dataset
-    assert collection.beside != other.beside
+    assert collection.extra_inputs != other.extra_inputs
 
 
 def test_a_task_of_photographs_refuses_a_place() -> None:
@@ -50,56 +50,56 @@ class Counted(Pixels):
 
     def read(self) -> np.ndarray:
         self.reads += 1
-        return np.array(texture(self.seed))
+        return np.array(draw_texture(self.seed))
 
 
 def test_features_are_kept_by_content_and_made_again_when_damaged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     image, extractor = Counted(1), Sift()
-    first = feature_cache.features(extractor, image)
-    assert same(first, extractor.extract(np.array(texture(1))))
-    assert same(first, feature_cache.features(extractor, image))
+    first = feature_cache.extract(extractor, image)
+    assert same(first, extractor.extract(np.array(draw_texture(1))))
+    assert same(first, feature_cache.extract(extractor, image))
     assert image.reads == 1
-    assert len(feature_cache.features(Sift(max_keypoints=3), image)) <= 3  # another extractor
-    assert not same(first, feature_cache.features(extractor, Counted(2)))  # another image
+    assert len(feature_cache.extract(Sift(max_keypoints=3), image)) <= 3  # another extractor
+    assert not same(first, feature_cache.extract(extractor, Counted(2)))  # another image
     assert image.reads == 2
     for file in (tmp_path / "cache").rglob("*.safetensors"):
         file.write_bytes(file.read_bytes()[:-9])
-    assert same(first, feature_cache.features(extractor, image))
+    assert same(first, feature_cache.extract(extractor, image))
     assert image.reads == 3
     assert "made again" in caplog.text
 
 
 def test_words_of_the_references_are_clustered_to_the_number_asked_for(tmp_path: Path) -> None:
-    place = Place(scene(tmp_path / "scene"), Sift())
-    public = Public(place=place)
+    index = SceneIndex(write_scene(tmp_path / "scene"), Sift())
+    public = Public(scene_index=index)
     few, more = public.dictionary("references", 20), public.dictionary("references", 40)
     assert (len(few), len(more)) == (20, 40)
     assert not set(map(bytes, few.words)) <= set(map(bytes, more.words))  # not the first of more
     assert few.digest != more.digest
-    again = Public(place=Place(scene(tmp_path / "scene"), Sift())).dictionary("references", 20)
+    again = Public(scene_index=SceneIndex(write_scene(tmp_path / "scene"), Sift())).dictionary("references", 20)
     np.testing.assert_array_equal(again.words, few.words)
     with pytest.raises(UserError, match="too few for 1000000 words"):
         public.dictionary("references", 1_000_000)
-    with pytest.raises(UserError, match="about no place"):
+    with pytest.raises(UserError, match="this task has no scene"):
         Public().dictionary("references")
 
 
 def test_more_words_than_the_limit_on_keypoints_gives_are_made_of_all_keypoints(tmp_path: Path) -> None:
-    place = Place(scene(tmp_path / "scene"), Sift(max_keypoints=5))
-    assert sum(map(len, place.references)) == 15
-    assert len(place.dictionary(15)) == 15
-    assert len(place.dictionary(40)) == 40
+    index = SceneIndex(write_scene(tmp_path / "scene"), Sift(max_keypoints=5))
+    assert sum(map(len, index.reference_features)) == 15
+    assert len(index.build_dictionary(15)) == 15
+    assert len(index.build_dictionary(40)) == 40
 
 
 def test_a_place_keeps_no_query_for_attackers_to_find(tmp_path: Path) -> None:
-    whole = scene(tmp_path / "scene")
+    whole = write_scene(tmp_path / "scene")
     assert whole.queries
-    assert Place(whole, Sift()).scene.queries == ()
-    assert Place(whole, Sift()).scene.references == whole.references
+    assert SceneIndex(whole, Sift()).scene.queries == ()
+    assert SceneIndex(whole, Sift()).scene.references == whole.references
 
 
 def test_a_scene_without_queries_is_a_mistake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    bare: Scene = dataclasses.replace(scene(tmp_path / "scene"), queries=())
+    bare: Scene = dataclasses.replace(write_scene(tmp_path / "scene"), queries=())
     monkeypatch.setattr(Gallery, "scene", lambda self: bare)
     with pytest.raises(UserError, match="has no queries"):
         samples.collect_queries(TINY)

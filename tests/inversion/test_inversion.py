@@ -1,4 +1,4 @@
-"""The inversion network: encoding, loss, training that resumes exactly, weights, and the rule about quantised photographs."""
+"""The inversion network: encoding, loss, exact resumption of training, weights, and the rule about dictionaries."""
 
 import dataclasses
 
@@ -7,7 +7,6 @@ import pytest
 import torch
 from skimage.metrics import structural_similarity
 
-from bench.api import Asset, Between, OneOf
 from bench.cli import main
 from bench.codebook import build, dictionary
 from bench.codebook.public import Public
@@ -15,15 +14,16 @@ from bench.core.errors import UserError
 from bench.extractors.sift import Sift
 from bench.images import photographs
 from bench.images.photographs import Source
-from bench.images.views import OnDemand, collect
+from bench.images.views import LazyViews, collect_views
 from bench.inversion import data, weights
-from bench.inversion.encoding import Points, condition, encode, stack
+from bench.inversion.encoding import EncodedRelease, encode, encode_settings, stack
 from bench.inversion.loss import reconstruction_loss, ssim
 from bench.inversion.network import Inverter, Shape
 from bench.inversion.plan import Plan, Training
-from bench.inversion.reconstruct import paint
+from bench.inversion.reconstruct import infer
 from bench.inversion.train import check_quantisation, train
-from bench.types import Descriptors, Subspaces, WordSets
+from bench.settings import Asset, Between, OneOf
+from bench.types import Descriptors, Points, Subspaces, WordSets
 from defenses.affine import Affine, reparameterise
 from defenses.ldp import LDP
 from defenses.none import Undefended
@@ -33,7 +33,7 @@ TINY = Training(steps=6, batch=2, warmup=2)
 
 @pytest.fixture(scope="module")
 def sources():
-    return photographs.builtin()
+    return photographs.list_builtin()
 
 
 @pytest.fixture(scope="module")
@@ -47,65 +47,65 @@ def album(sources, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def words(album, tmp_path_factory):
-    """A dictionary made from the two photographs of the album."""
+    """A dictionary built from the two photographs of the album."""
     path = tmp_path_factory.mktemp("k") / "K.safetensors"
     build.build(album, 3000, path, Sift(), seed=0)
     return Asset(path)
 
 
-def example_releases(rng, count=5):
-    where = {"keypoints": rng.uniform(0, 256, (count, 2)).astype(np.float32), "size": (256, 256)}
+def draw_releases(rng, count=5):
+    common = {"positions": Points(keypoints=rng.uniform(0, 256, (count, 2)).astype(np.float32)), "size": (256, 256)}
     unit = rng.normal(size=(count, 3, 128)).astype(np.float32)
     return [
-        Descriptors(**where, descriptors=unit[:, 0]),
-        WordSets(**where, candidates=unit, words=None),
-        Subspaces(**where, origins=unit[:, 0], bases=unit[:, 1:]),
+        Descriptors(**common, descriptors=unit[:, 0]),
+        WordSets(**common, candidates=unit, words=None),
+        Subspaces(**common, origins=unit[:, 0], bases=unit[:, 1:]),
     ]
 
 
 def test_every_kind_of_release_has_a_stacking(rng):
-    assert [stack(release, "invariant").shape[1] for release in example_releases(rng)] == [1, 3, 17]
+    assert [stack(release, "invariant").shape[1] for release in draw_releases(rng)] == [1, 3, 17]
     with pytest.raises(TypeError, match="no stacking"):
         stack(object(), "invariant")
 
 
-def test_subspaces_are_read_as_themselves_and_not_as_they_were_written(rng):
+def test_the_stacking_of_subspaces_depends_on_the_subspace_and_not_on_its_basis(rng):
     """Two re-parameterisations of one D stack alike; two different D do not (negative control)."""
     d = rng.normal(size=(20, 128))
     span = np.linalg.qr(rng.normal(size=(20, 128, 6)))[0].transpose(0, 2, 1)
-    where = {"keypoints": np.zeros((20, 2), np.float32), "size": (256, 256)}
+    common = {"positions": Points(keypoints=np.zeros((20, 2), np.float32)), "size": (256, 256)}
 
-    def stacked(point):
+    def stack_subspaces(point):
         origins, bases = reparameterise(point, span, rng)
-        return stack(Subspaces(**where, origins=origins, bases=bases), "invariant")
+        return stack(Subspaces(**common, origins=origins, bases=bases), "invariant")
 
-    first = stacked(d)
-    np.testing.assert_allclose(first, stacked(d), atol=1e-5)
-    np.testing.assert_allclose(first, stacked(d + rng.normal(size=(20, 1)) * span[:, 0]), atol=1e-5)
-    assert np.abs(first - stacked(rng.normal(size=(20, 128)))).max() > 0.1
+    first = stack_subspaces(d)
+    np.testing.assert_allclose(first, stack_subspaces(d), atol=1e-5)
+    np.testing.assert_allclose(first, stack_subspaces(d + rng.normal(size=(20, 1)) * span[:, 0]), atol=1e-5)
+    assert np.abs(first - stack_subspaces(rng.normal(size=(20, 128)))).max() > 0.1
 
 
-def test_the_papers_stacking_changes_with_the_basis_that_was_drawn(rng):
+def test_the_stacking_of_the_paper_depends_on_the_random_basis(rng):
     d, span = rng.normal(size=(20, 128)), np.linalg.qr(rng.normal(size=(20, 128, 6)))[0].transpose(0, 2, 1)
-    where = {"keypoints": np.zeros((20, 2), np.float32), "size": (256, 256)}
+    common = {"positions": Points(keypoints=np.zeros((20, 2), np.float32)), "size": (256, 256)}
 
-    def stacked():
+    def stack_released():
         origins, bases = reparameterise(d, span, rng)
-        return stack(Subspaces(**where, origins=origins, bases=bases), "released")
+        return stack(Subspaces(**common, origins=origins, bases=bases), "released")
 
-    assert stacked().shape == (20, 1 + 6, 128)
-    assert np.abs(stacked() - stacked()).max() > 0.1
+    assert stack_released().shape == (20, 1 + 6, 128)
+    assert np.abs(stack_released() - stack_released()).max() > 0.1
 
 
 def test_positions_alone_encode_no_descriptor(rng):
-    first, second, third = (encode([release], [np.empty(0, np.float32)], 0, "positions") for release in example_releases(rng))
+    first, second, third = (encode([release], [np.empty(0, np.float32)], 0, "positions") for release in draw_releases(rng))
     assert first.values.shape == (5, 2)
     assert torch.equal(first.values, second.values)
     assert torch.equal(first.values, third.values)
 
 
-def test_frames_are_encoded_where_they_are_sent(rng):
-    release = example_releases(rng)[0]
+def test_released_frames_are_encoded(rng):
+    release = draw_releases(rng)[0]
     framed = dataclasses.replace(release, frames=np.array([[8.0, np.pi / 2]] * 5, np.float32))
     values = encode([framed], [np.ones(1, np.float32)], 1, "invariant").values
     np.testing.assert_allclose(values[:, 130:], [[1, 0, 1, 1]] * 5, atol=1e-6)  # an octave over 4 pixels, cosine, sine; condition
@@ -114,31 +114,31 @@ def test_frames_are_encoded_where_they_are_sent(rng):
 
 
 def test_a_set_network_ignores_order_and_padding(rng):
-    release = example_releases(rng)[1]
+    release = draw_releases(rng)[1]
     shuffled = dataclasses.replace(release, candidates=release.candidates[:, ::-1])
-    told = [np.ones(1, np.float32)]
+    settings = [np.ones(1, np.float32)]
 
-    def painted(network, of, slots):
-        return network(encode([of], told, slots, "invariant"))
+    def run(network, release, slots):
+        return network(encode([release], settings, slots, "invariant"))
 
     torch.manual_seed(0)
-    reads_sets = Inverter(Shape(inputs=4 * 128 + 3, candidates=4, length=128)).eval()
-    torch.testing.assert_close(painted(reads_sets, release, 4), painted(reads_sets, shuffled, 4))
+    set_network = Inverter(Shape(inputs=4 * 128 + 3, candidates=4, length=128)).eval()
+    torch.testing.assert_close(run(set_network, release, 4), run(set_network, shuffled, 4))
     fewer = Inverter(Shape(inputs=3 * 128 + 3, candidates=3, length=128)).eval()
-    fewer.load_state_dict(reads_sets.state_dict())
-    torch.testing.assert_close(painted(fewer, release, 3), painted(reads_sets, release, 4))
-    reads_stacks = Inverter(Shape(inputs=4 * 128 + 3)).eval()  # negative control
-    assert not torch.allclose(painted(reads_stacks, release, 4), painted(reads_stacks, shuffled, 4), atol=1e-4)
+    fewer.load_state_dict(set_network.state_dict())
+    torch.testing.assert_close(run(fewer, release, 3), run(set_network, release, 4))
+    stack_network = Inverter(Shape(inputs=4 * 128 + 3)).eval()  # negative control
+    assert not torch.allclose(run(stack_network, release, 4), run(stack_network, shuffled, 4), atol=1e-4)
 
 
-def test_encoding_pads_and_places(rng):
-    release = example_releases(rng)[1]
+def test_encoding_pads_candidates_and_computes_cells(rng):
+    release = draw_releases(rng)[1]
     points = encode([release, release], [np.array([0.25], np.float32)] * 2, slots=4, encoding="invariant")
     assert points.values.shape == (10, 4 * 128 + 2 + 1)
     assert (points.values[:, 3 * 128 : 4 * 128] == 0).all()
     assert (points.values[:, -1] == 0.25).all()
     row, column = int(release.keypoints[0, 1] // 4), int(release.keypoints[0, 0] // 4)
-    assert points.places[0].long().tolist() == [column, row]
+    assert points.coordinates[0].long().tolist() == [column, row]
     assert points.image.tolist() == [0] * 5 + [1] * 5
     assert points.grid == (64, 64)
     with pytest.raises(ValueError, match="at most 2"):
@@ -147,34 +147,36 @@ def test_encoding_pads_and_places(rng):
 
 def test_keypoints_on_the_border_stay_in_the_grid():
     corners = np.array([[0, 0], [256, 256], [-1, 300]], np.float32)
-    release = Descriptors(keypoints=corners, size=(256, 256), descriptors=np.zeros((3, 128), np.float32))
+    release = Descriptors(positions=Points(keypoints=corners), size=(256, 256), descriptors=np.zeros((3, 128), np.float32))
     points = encode([release], [np.empty(0, np.float32)], slots=1, encoding="invariant")
-    assert points.places.long().tolist() == [[0, 0], [63, 63], [0, 63]]
+    assert points.coordinates.long().tolist() == [[0, 0], [63, 63], [0, 63]]
 
 
-def test_conditions_are_the_served_settings():
-    served = {"epsilon": Between(8.0, 16.0), "subset_size": OneOf((1, 2, 3, 4))}
-    assert np.allclose(condition(LDP(epsilon=10, subset_size=4), served), [0.25, 1.0])
-    assert condition(Undefended(), {}).shape == (0,)
+def test_settings_are_encoded_by_their_supported_range():
+    supported = {"epsilon": Between(8.0, 16.0), "subset_size": OneOf((1, 2, 3, 4))}
+    assert np.allclose(encode_settings(LDP(epsilon=10, subset_size=4), supported), [0.25, 1.0])
+    assert encode_settings(Undefended(), {}).shape == (0,)
 
 
-def scattered(net, values, places, size=(64, 48)):
+def scatter(net, values, coordinates, size=(64, 48)):
     with torch.inference_mode():
-        return net.scatter(Points(values, places, torch.zeros(len(values), dtype=torch.int64), 1, size))[0]  # (C, H/4, W/4)
+        return net.scatter(EncodedRelease(values, coordinates, torch.zeros(len(values), dtype=torch.int64), 1, size))[
+            0
+        ]  # (C, H/4, W/4)
 
 
 @pytest.mark.parametrize("patch", [5, 6])
-def test_keypoints_that_share_a_cell_are_added_up(patch, rng):
+def test_keypoints_that_share_a_cell_are_summed(patch, rng):
     """The rule of `network.py`, whatever the order of the keypoints; patches reach as far on all sides, and not outside."""
-    net, counts = Inverter(Shape(inputs=130, widths=(9, 9), patch=patch, painted=2)).eval(), 8  # the channel that counts
+    net, counts = Inverter(Shape(inputs=130, widths=(9, 9), patch=patch, painted=2)).eval(), 8  # index of the count channel
     values = torch.from_numpy(rng.normal(size=(3, 130)).astype(np.float32))
-    places = torch.tensor([[7.3, 1.8], [7.6, 1.2], [0.2, 15.7]])
-    grid = scattered(net, values, places)
+    coordinates = torch.tensor([[7.3, 1.8], [7.6, 1.2], [0.2, 15.7]])
+    grid = scatter(net, values, coordinates)
     expected = torch.zeros(16, 12, counts + 3)
     with torch.inference_mode():
         hidden = net.embed(values)
         own, around = net.own(hidden), net.around(hidden).view(3, patch, patch, 2)
-    for keypoint, (x, y) in enumerate(places.tolist()):
+    for keypoint, (x, y) in enumerate(coordinates.tolist()):
         expected[int(y), int(x), :counts] += own[keypoint]
         expected[int(y), int(x), counts] += 1
         for row in range(patch):
@@ -184,20 +186,20 @@ def test_keypoints_that_share_a_cell_are_added_up(patch, rng):
                 if 0 <= down < 16 and 0 <= right < 12:
                     expected[down, right, counts + 1 :] += around[keypoint, row, column]
     torch.testing.assert_close(grid, expected.permute(2, 0, 1), atol=1e-5, rtol=1e-5)
-    torch.testing.assert_close(scattered(net, values.flip(0), places.flip(0)), grid, atol=1e-5, rtol=1e-5)
-    assert not torch.allclose(scattered(net, values.flip(0), places), grid, atol=1e-2)  # control: it matters who lies where
+    torch.testing.assert_close(scatter(net, values.flip(0), coordinates.flip(0)), grid, atol=1e-5, rtol=1e-5)
+    assert not torch.allclose(scatter(net, values.flip(0), coordinates), grid, atol=1e-2)  # control: the coordinates matter
 
 
 @pytest.mark.parametrize("size", [(256, 256), (255, 130), (7, 1)])
-def test_an_image_of_any_size_is_painted(size, rng):
+def test_an_image_of_any_size_is_reconstructed(size, rng):
     height, width = size
     release = Descriptors(
-        keypoints=rng.uniform(0, (width, height), (5, 2)).astype(np.float32),
+        positions=Points(keypoints=rng.uniform(0, (width, height), (5, 2)).astype(np.float32)),
         size=(width, height),
         descriptors=rng.normal(size=(5, 128)).astype(np.float32),
     )
     points = encode([release], [np.empty(0, np.float32)], slots=1, encoding="invariant")
-    assert paint(Inverter(Shape(inputs=130, widths=(8, 8, 8))).eval(), points).shape == (1, 3, height, width)
+    assert infer(Inverter(Shape(inputs=130, widths=(8, 8, 8))).eval(), points).shape == (1, 3, height, width)
 
 
 def test_ssim_of_the_loss_is_scikit_images(rng):
@@ -207,7 +209,7 @@ def test_ssim_of_the_loss_is_scikit_images(rng):
     ours = float(ssim(torch.from_numpy(a)[None], torch.from_numpy(b)[None]))
     assert ours == pytest.approx(full, abs=1e-5)
     other = structural_similarity(a, b, full=True, **settings | {"sigma": 1.0})[1][5:-5, 5:-5].mean()
-    assert ours != pytest.approx(other, abs=1e-4)  # negative control: the comparison tells settings apart
+    assert ours != pytest.approx(other, abs=1e-4)  # negative control: the comparison distinguishes settings
 
 
 def test_loss_of_the_truth_is_zero(rng):
@@ -216,10 +218,10 @@ def test_loss_of_the_truth_is_zero(rng):
     assert float(reconstruction_loss(1 - image, image)) > 0.1
 
 
-def of_two(sources, **given):
+def build_plan(sources, **given):
     """A training on two photographs, validated on a third."""
     data = {"photographs": sources[:2], "validation": sources[2:3], "extractor": Sift()}
-    return Plan(**{"defense": Undefended(), "served": {}} | data | given)
+    return Plan(**{"defense": Undefended(), "supported_settings": {}} | data | given)
 
 
 @pytest.mark.parametrize("defense", [Undefended(), Affine(lifting="random", dim=2)])
@@ -227,7 +229,7 @@ def test_a_resumed_training_is_the_same_training(defense, sources, tmp_path, mon
     import bench.inversion.train as module
 
     monkeypatch.setattr(module, "CHECKPOINT_EVERY", 3)
-    plan = of_two(sources, defense=defense, training=TINY)
+    plan = build_plan(sources, defense=defense, training=TINY, widths=(8, 8))
     whole = train(plan, tmp_path / "whole.safetensors")
     # Interrupt the second one after its third step.
     advance, steps = module._Trainer._advance, []
@@ -251,22 +253,22 @@ def test_a_resumed_training_is_the_same_training(defense, sources, tmp_path, mon
 
 
 @pytest.mark.parametrize("defense", [Undefended(), LDP(epsilon=8, subset_size=2, words=2000)])
-def test_views_made_on_demand_train_the_same_network(defense, sources, tmp_path, monkeypatch):
-    """What does not fit into memory is read again and again, and changes nothing."""
+def test_views_on_demand_train_the_same_network(defense, sources, tmp_path, monkeypatch):
+    """Views that do not fit into memory are read repeatedly, with the same result."""
     import bench.inversion.train as module
 
-    plan = of_two(sources, defense=defense, training=TINY, widths=(8, 8))
-    kept = train(plan, tmp_path / "kept.safetensors")
-    monkeypatch.setattr(module, "IN_MEMORY", 1)
-    made = train(plan, tmp_path / "made.safetensors")
-    assert made == kept
-    assert weights.load(tmp_path / "kept.safetensors").digest == weights.load(tmp_path / "made.safetensors").digest
+    plan = build_plan(sources, defense=defense, training=TINY, widths=(8, 8))
+    in_memory = train(plan, tmp_path / "in-memory.safetensors")
+    monkeypatch.setattr(module, "MAX_IN_MEMORY", 1)
+    on_demand = train(plan, tmp_path / "on-demand.safetensors")
+    assert on_demand == in_memory
+    assert weights.load(tmp_path / "in-memory.safetensors").digest == weights.load(tmp_path / "on-demand.safetensors").digest
 
 
-def test_views_on_demand_leave_out_what_cannot_be_read(sources, tmp_path, rng):
-    spoilt = Source("spoilt", tmp_path / "spoilt.png")
-    spoilt.path.write_bytes(b"no picture")
-    lazy, eager = OnDemand([spoilt, sources[0]], Sift()), collect([spoilt, sources[0]], Sift())
+def test_views_on_demand_skip_unreadable_files(sources, tmp_path, rng):
+    unreadable = Source("unreadable", tmp_path / "unreadable.png")
+    unreadable.path.write_bytes(b"no picture")
+    lazy, eager = LazyViews([unreadable, sources[0]], Sift()), collect_views([unreadable, sources[0]], Sift())
     assert [len(lazy), len(lazy[::4]), len(list(lazy)), len(eager)] == [8, 2, 4, 4]
     for one, other in zip(lazy, eager, strict=True):
         assert one.photograph == other.photograph
@@ -278,33 +280,33 @@ def test_views_on_demand_leave_out_what_cannot_be_read(sources, tmp_path, rng):
 
 
 @pytest.mark.parametrize(("slots", "candidates"), [(1, 1), (3, 1), (4, 4)])
-def test_a_network_started_from_another_reads_a_descriptor_as_it_does(slots, candidates, rng):
-    """A release whose first slot holds the descriptor is painted as by the network for raw descriptors."""
+def test_a_network_initialised_from_one_for_raw_descriptors_gives_the_same_image(slots, candidates, rng):
+    """A release whose first slot holds the descriptor gives the image of the network for raw descriptors."""
     trained, fresh = Inverter(Shape(inputs=130)).eval(), Inverter(Shape(inputs=slots * 128 + 2 + 1)).eval()
-    weights.start_from(fresh, trained, candidates)
-    raw = example_releases(rng)[0]
+    weights.initialise_from(fresh, trained, candidates)
+    raw = draw_releases(rng)[0]
     rows = np.zeros((len(raw), slots, 128), np.float32)
     rows[:, 0] = raw.descriptors * np.float32(candidates**0.5)
-    padded = WordSets(keypoints=raw.keypoints, size=raw.size, candidates=rows, words=None)
-    mine = fresh(encode([padded], [np.ones(1, np.float32)], slots, "invariant"))
-    theirs = trained(encode([raw], [np.empty(0, np.float32)], 1, "invariant"))
-    torch.testing.assert_close(mine, theirs, atol=1e-4, rtol=1e-4)
+    padded = WordSets(positions=Points(keypoints=raw.keypoints), size=raw.size, candidates=rows, words=None)
+    found = fresh(encode([padded], [np.ones(1, np.float32)], slots, "invariant"))
+    expected = trained(encode([raw], [np.empty(0, np.float32)], 1, "invariant"))
+    torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-4)
     assert not torch.allclose(
-        Inverter(Shape(inputs=130)).eval()(encode([raw], [np.empty(0, np.float32)], 1, "invariant")), theirs, atol=1e-2
+        Inverter(Shape(inputs=130)).eval()(encode([raw], [np.empty(0, np.float32)], 1, "invariant")), expected, atol=1e-2
     )
 
 
 @pytest.mark.parametrize(
     "shape", [Shape(inputs=2), Shape(inputs=3 * 128 + 3), Shape(inputs=4 * 128 + 3, candidates=4, length=128)], ids=str
 )
-def test_a_network_started_from_one_for_such_releases_is_that_one(shape):
-    """It goes on where the other ended, with all slots and the condition."""
+def test_a_network_initialised_from_one_for_the_same_releases_is_equal(shape):
+    """All slots and settings are copied."""
     trained, fresh = Inverter(shape), Inverter(shape)
-    weights.start_from(fresh, trained, max(1, shape.candidates))
+    weights.initialise_from(fresh, trained, max(1, shape.candidates))
     assert all(torch.equal(value, fresh.state_dict()[name]) for name, value in trained.state_dict().items())
-    stranger = Inverter(Shape(inputs=2 * 128 + 3))  # of fewer slots
+    other = Inverter(Shape(inputs=2 * 128 + 3))  # of fewer slots
     with pytest.raises(UserError, match="reads other releases"):
-        weights.start_from(stranger, trained, 1)
+        weights.initialise_from(other, trained, 1)
 
 
 def test_training_learns(sources, tmp_path):
@@ -320,7 +322,7 @@ def test_training_learns(sources, tmp_path):
 
     original, module._Trainer = module._Trainer, Watched
     try:
-        train(of_two(sources, training=Training(steps=40, batch=2, warmup=5)), tmp_path / "W")
+        train(build_plan(sources, training=Training(steps=40, batch=2, warmup=5)), tmp_path / "W")
     finally:
         module._Trainer = original
     assert np.mean(losses[-5:]) < 0.75 * np.mean(losses[:5])
@@ -329,7 +331,7 @@ def test_training_learns(sources, tmp_path):
 def test_a_checkpoint_of_another_training_is_refused(sources, tmp_path, monkeypatch):
     import bench.inversion.train as module
 
-    plan, out = of_two(sources, training=TINY), tmp_path / "W.safetensors"
+    plan, out = build_plan(sources, training=TINY), tmp_path / "W.safetensors"
     monkeypatch.setattr(module.weights, "save", lambda *_: (_ for _ in ()).throw(OSError("the disk is full")))
     with pytest.raises(OSError, match="disk"):
         train(plan, out)
@@ -339,50 +341,49 @@ def test_a_checkpoint_of_another_training_is_refused(sources, tmp_path, monkeypa
 
 def test_photographs_in_both_sets_are_refused(sources, tmp_path):
     with pytest.raises(UserError, match="in both"):
-        train(dataclasses.replace(of_two(sources), validation=sources[1:2]), tmp_path / "W")
+        train(dataclasses.replace(build_plan(sources), validation=sources[1:2]), tmp_path / "W")
 
 
-def test_own_photographs_quantise_to_nearly_themselves(sources, words):
-    """Negative control of the rule: a network trained on its own dictionary's photographs fails the check."""
+def test_photographs_of_a_dictionary_quantise_to_nearly_themselves(sources, words):
+    """Negative control of the rule: training photographs that the dictionary was built from fail the check."""
     public = Public()
-    own, unseen = collect(sources[:2], Sift()), collect(sources[2:4], Sift())
-    chosen = {view.photograph: words for view in own + unseen}
-    known, unknown = (data.quantisation_error(views, chosen, public) for views in (own, unseen))
-    assert known < 0.9 * unknown
-    with pytest.raises(UserError, match="trust words"):
-        check_quantisation(known, unknown)
-    check_quantisation(0.98 * unknown, unknown)
+    own, unseen = collect_views(sources[:2], Sift()), collect_views(sources[2:4], Sift())
+    assigned = {view.photograph: words for view in own + unseen}
+    own_error, unseen_error = (data.measure_quantisation_error(views, assigned, public) for views in (own, unseen))
+    assert own_error < 0.9 * unseen_error
+    with pytest.raises(UserError, match="trust in words"):
+        check_quantisation(own_error, unseen_error)
+    check_quantisation(0.98 * unseen_error, unseen_error)
 
 
 def test_a_photograph_is_never_quantised_by_its_own_dictionary(sources, words, tmp_path):
     public = Public()
     inside, outside = sources[0].content_hash(), sources[3].content_hash()
     with pytest.raises(UserError, match="--crossfit"):
-        data.fitting_dictionaries({inside, outside}, [words], public)
-    stranger = Asset(tmp_path / "other.safetensors")
-    dictionary.save(stranger_path := tmp_path / "other.safetensors", public.dictionary(words).words[:2000], {"photographs": []})
-    assert stranger_path.is_file()
-    assert data.fitting_dictionaries({inside, outside}, [words, stranger], public) == {inside: stranger, outside: words}
+        data.assign_dictionaries({inside, outside}, [words], public)
+    unrelated = Asset(tmp_path / "other.safetensors")
+    dictionary.save(tmp_path / "other.safetensors", public.dictionary(words).words[:2000], {"photographs": []})
+    assert data.assign_dictionaries({inside, outside}, [words, unrelated], public) == {inside: unrelated, outside: words}
 
 
-def test_one_epsilon_must_mean_one_chance_of_the_truth(sources, words, tmp_path):
-    """Of fewer words the true one is told more often, at the same epsilon."""
+def test_dictionaries_must_have_equal_size(sources, words, tmp_path):
+    """At the same epsilon, fewer words contain the true word more often."""
     public, few = Public(), Asset(tmp_path / "few.safetensors")
     dictionary.save(tmp_path / "few.safetensors", public.dictionary(words).words[:2000], {"photographs": []})
     defense = LDP(epsilon=6.0, dictionary=words)
     assert dataclasses.replace(defense, dictionary=few).privacy(public).log10_true > defense.privacy(public).log10_true
-    with pytest.raises(UserError, match="other sizes"):
-        train(of_two(sources, defense=defense, crossfit=[few], training=TINY), tmp_path / "W.safetensors")
-    data.check_lengths({words, few}, [2000, 1000], public)  # of the first words of each there are as many
-    with pytest.raises(UserError, match="other sizes"):
-        data.check_lengths({words, few}, [1000, 0], public)
+    with pytest.raises(UserError, match="different sizes"):
+        train(build_plan(sources, defense=defense, crossfit=[few], training=TINY), tmp_path / "W.safetensors")
+    data.check_dictionary_sizes({words, few}, [2000, 1000], public)  # both have that many words
+    with pytest.raises(UserError, match="different sizes"):
+        data.check_dictionary_sizes({words, few}, [1000, 0], public)
 
 
-def test_quantisation_once_is_quantisation_each_time(sources, words):
-    views = collect(sources[3:4], Sift())
-    chosen = {view.photograph: words for view in views}
+def test_the_quantisation_table_agrees_with_single_queries(sources, words):
+    views = collect_views(sources[3:4], Sift())
+    assigned = {view.photograph: words for view in views}
     sizes, plain = [0, 2000, 500], Public()
-    table = data.quantise(views, chosen, sizes, Public())
+    table = data.quantise(views, assigned, sizes, Public())
     for view in views:
         for size in sizes:
             expected = plain.nearest_words(words, view.features, size)
@@ -391,50 +392,50 @@ def test_quantisation_once_is_quantisation_each_time(sources, words):
         table(plain.dictionary(words), np.full((1, 128), 7, np.uint8))
 
 
-def test_crops_keep_what_lies_within(sources, rng):
-    view = max(collect(sources[:1], Sift()), key=lambda view: len(view.pixels))
-    place = {tuple(code): number for number, code in enumerate(view.features.codes)}
+def test_crops_contain_the_keypoints_inside_them(sources, rng):
+    view = max(collect_views(sources[:1], Sift()), key=lambda view: len(view.pixels))
+    index = {tuple(code): number for number, code in enumerate(view.features.codes)}
     for _ in range(10):
-        pixels, features = data.random_crop(view, rng)
-        offsets = view.features.keypoints[[place[tuple(code)] for code in features.codes]] - features.keypoints
+        pixels, features = data.draw_crop(view, rng)
+        offsets = view.features.keypoints[[index[tuple(code)] for code in features.codes]] - features.keypoints
         left, top = np.rint(np.median(offsets, axis=0)).astype(int)
         assert np.array_equal(pixels, view.pixels[top : top + 256, left : left + 256])
         inside = ((view.features.keypoints >= (left, top)) & (view.features.keypoints < (left + 256, top + 256))).all(axis=1)
         assert np.array_equal(features.codes, view.features.codes[inside])
 
 
-def test_a_network_knows_what_it_was_trained_for(sources, words, tmp_path):
+def test_a_network_is_incompatible_with_other_releases(sources, words, tmp_path):
     public, path = Public(), tmp_path / "W.safetensors"
-    served = {"epsilon": Between(8.0, 16.0), "subset_size": OneOf((1, 2))}
+    supported = {"epsilon": Between(8.0, 16.0), "subset_size": OneOf((1, 2))}
     shape = Shape(inputs=2 * 128 + 2 + 2)
-    meta = {**weights.describe(LDP(dictionary=words), served, Sift(), public), "encoding": "released", "slots": 2}
+    meta = {**weights.describe(LDP(dictionary=words), supported, Sift(), public), "encoding": "released", "slots": 2}
     weights.save(path, Inverter(shape), shape, meta)
-    found = weights.load(path).meta
-    fits = LDP(epsilon=9, subset_size=2, dictionary=words)
-    assert weights.misfit(found, fits, Sift(), public) is None
+    meta = weights.load(path).meta
+    compatible = LDP(epsilon=9, subset_size=2, dictionary=words)
+    assert weights.explain_incompatible(meta, compatible, Sift(), public) is None
     for other, extractor, reason in [
-        (dataclasses.replace(fits, epsilon=20), Sift(), "epsilon 8 to 16, not 20"),
-        (dataclasses.replace(fits, subset_size=3), Sift(), "subset_size 1, 2, not 3"),
+        (dataclasses.replace(compatible, epsilon=20), Sift(), "epsilon 8 to 16, not 20"),
+        (dataclasses.replace(compatible, subset_size=3), Sift(), "subset_size 1, 2, not 3"),
         (Undefended(), Sift(), "trained for ldp"),
-        (fits, Sift(upright=False), "features with upright True, not False"),
+        (compatible, Sift(upright=False), "features with upright True, not False"),
     ]:
-        assert reason in (weights.misfit(found, other, extractor, public) or "")
+        assert reason in (weights.explain_incompatible(meta, other, extractor, public) or "")
     copied = tmp_path / "other.safetensors"
     dictionary.save(copied, public.dictionary(words).words[::-1], {"photographs": []})
-    assert "dictionary sha256" in (weights.misfit(found, LDP(dictionary=Asset(copied)), Sift(), public) or "")
+    assert "dictionary sha256" in (weights.explain_incompatible(meta, LDP(dictionary=Asset(copied)), Sift(), public) or "")
 
 
-OF_RAW = {**weights.describe(Undefended(), {}, Sift(), Public()), "encoding": "invariant", "slots": 1}
+RAW_METADATA = {**weights.describe(Undefended(), {}, Sift(), Public()), "encoding": "invariant", "slots": 1}
 
 
-def test_weights_keep_the_network(sources, tmp_path, rng):
+def test_saved_weights_give_the_same_network(sources, tmp_path, rng):
     shape = Shape(inputs=130)
     net = Inverter(shape).eval()
     path = tmp_path / "W.safetensors"
-    weights.save(path, net, shape, OF_RAW)
-    points = encode([example_releases(rng)[0]], [np.empty(0, np.float32)], slots=1, encoding="invariant")
-    torch.testing.assert_close(paint(weights.load(path).module, points), paint(net, points), atol=0.02, rtol=0)
-    assert torch.equal(paint(net, points), paint(net, points))
+    weights.save(path, net, shape, RAW_METADATA)
+    points = encode([draw_releases(rng)[0]], [np.empty(0, np.float32)], slots=1, encoding="invariant")
+    torch.testing.assert_close(infer(weights.load(path).module, points), infer(net, points), atol=0.02, rtol=0)
+    assert torch.equal(infer(net, points), infer(net, points))
 
 
 @pytest.mark.parametrize(
@@ -445,60 +446,60 @@ def test_weights_keep_the_network(sources, tmp_path, rng):
         (lambda arrays: dict(list(arrays.items())[1:]), "nothing, expected"),
     ],
 )
-def test_weights_that_do_not_fit(spoil, message, tmp_path):
+def test_weights_of_another_network_are_refused(spoil, message, tmp_path):
     from bench.formats import tensor_file
 
     shape, path = Shape(inputs=130), tmp_path / "W.safetensors"
-    weights.save(path, Inverter(shape), shape, OF_RAW)
+    weights.save(path, Inverter(shape), shape, RAW_METADATA)
     arrays, meta, _ = tensor_file.load(path, weights.KIND)
     tensor_file.save(path, weights.KIND, spoil(arrays), meta)
     with pytest.raises(UserError, match=message):
         weights.load(path)
 
 
-def test_what_half_precision_cannot_hold_is_kept_whole(tmp_path, rng):
+def test_weights_outside_the_range_of_half_precision_are_stored_in_single_precision(tmp_path, rng):
     """A batch norm's variance above 65,504 would be infinite, and its channel silent."""
     shape, path = Shape(inputs=130), tmp_path / "W.safetensors"
     network = Inverter(shape).eval()
     network.stem[1].running_var.fill_(1e5)
-    network.stem[0].weight.data.mul_(1e5**0.5)  # as training makes it: large, and normed to what it was
-    points = encode([example_releases(rng)[0]], [np.empty(0, np.float32)], 1, "invariant")
-    painted = network(points)
-    weights.save(path, network, shape, OF_RAW)
-    torch.testing.assert_close(weights.load(path).module(points), painted, atol=2e-3, rtol=0)
+    network.stem[0].weight.data.mul_(1e5**0.5)  # large, and normalised to the same output
+    points = encode([draw_releases(rng)[0]], [np.empty(0, np.float32)], 1, "invariant")
+    expected = network(points)
+    weights.save(path, network, shape, RAW_METADATA)
+    torch.testing.assert_close(weights.load(path).module(points), expected, atol=2e-3, rtol=0)
     assert path.stat().st_size < 0.51 * sum(4 * value.numel() for value in network.state_dict().values())
-    network.stem[1].running_var.fill_(np.inf)  # the control: what would have been kept
-    assert not torch.allclose(network(points), painted, atol=2e-3, rtol=0)
-    weights.save(path, network, shape, OF_RAW)
-    with pytest.raises(UserError, match=r"stem.1.running_var has numbers that are not finite"):
+    network.stem[1].running_var.fill_(np.inf)  # control: the half-precision value
+    assert not torch.allclose(network(points), expected, atol=2e-3, rtol=0)
+    weights.save(path, network, shape, RAW_METADATA)
+    with pytest.raises(UserError, match=r"stem.1.running_var has non-finite numbers"):
         weights.load(path)
 
 
-def test_weights_that_say_too_little(tmp_path):
+def test_weights_without_metadata_are_refused(tmp_path):
     shape, path = Shape(inputs=130), tmp_path / "W.safetensors"
-    weights.save(path, Inverter(shape), shape, {name: told for name, told in OF_RAW.items() if name != "encoding"})
-    with pytest.raises(UserError, match="do not say encoding"):
+    weights.save(path, Inverter(shape), shape, {name: value for name, value in RAW_METADATA.items() if name != "encoding"})
+    with pytest.raises(UserError, match="metadata lack encoding"):
         weights.load(path)
 
 
-def test_from_the_command_line(album, tmp_path, sources, capsys):
+def test_bench_train_trains_resumes_and_continues(album, tmp_path, sources, capsys):
     held = tmp_path / "held"
     held.mkdir()
     (held / "coffee.png").write_bytes(sources[2].path.read_bytes())
     out = tmp_path / "W.safetensors"
     command = ["train", "--defense", "none", "--images", str(album), "--validation", str(held), "--out", str(out)]
     assert main([*command, "--steps", "2", "--batch", "2"]) == 0
-    assert "4 crops of 2 photographs" in capsys.readouterr().out
+    assert "4 training samples from 2 photographs" in capsys.readouterr().out
     before = out.read_bytes()
-    assert main([*command, "--steps", "2", "--batch", "2"]) == 0  # done is done
+    assert main([*command, "--steps", "2", "--batch", "2"]) == 0  # the network exists
     again = tmp_path / "again.safetensors"
-    assert main([*command[:-1], str(again), "--steps", "2", "--batch", "2", "--start", str(out)]) == 0
+    assert main([*command[:-1], str(again), "--steps", "2", "--batch", "2", "--initial-checkpoint", str(out)]) == 0
     assert weights.load(again).meta["start"] == weights.load(out).digest
     third = tmp_path / "third.safetensors"
-    assert main([*command[:-1], str(third), "--steps", "1", "--batch", "2", "--start", str(again)]) == 0
-    told = weights.legs(weights.load(third).meta)
-    assert [leg["start"] for leg in told] == [None, weights.load(out).digest, weights.load(again).digest]
-    assert [leg["crops"] for leg in told] == [4, 4, 2]
+    assert main([*command[:-1], str(third), "--steps", "1", "--batch", "2", "--initial-checkpoint", str(again)]) == 0
+    stages = weights.list_training_stages(weights.load(third).meta)
+    assert [stage["start"] for stage in stages] == [None, weights.load(out).digest, weights.load(again).digest]
+    assert [stage["crops"] for stage in stages] == [4, 4, 2]
     assert main([*command, "--steps", "3", "--batch", "2"]) == 2
     assert "another training" in capsys.readouterr().err.splitlines()[-1]
     assert out.read_bytes() == before

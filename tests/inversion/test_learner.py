@@ -1,4 +1,4 @@
-"""A step of training: what it changes, and how near it comes to the machine's rate of multiplying matrices."""
+"""A training step: its effect, and its speed relative to matrix products."""
 
 import numpy as np
 import pytest
@@ -6,20 +6,20 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from bench.core.device import pick_dtype
-from bench.inversion.encoding import Points, encode
+from bench.inversion.encoding import EncodedRelease, encode
 from bench.inversion.learner import Learner
 from bench.inversion.network import Inverter, Shape
 from bench.inversion.plan import Training
-from bench.types import Descriptors
+from bench.types import Descriptors, Points
 
 BATCH, KEYPOINTS = 8, 600
-SIDE = 2048  # of the matrices whose product is the floor
+SIDE = 2048  # of the matrices whose product is the reference
 
 
-def batch(rng: np.random.Generator, count: int = BATCH) -> tuple[Points, torch.Tensor]:
+def batch(rng: np.random.Generator, count: int = BATCH) -> tuple[EncodedRelease, torch.Tensor]:
     releases = [
         Descriptors(
-            keypoints=rng.uniform(0, 256, (KEYPOINTS, 2)).astype(np.float32),
+            positions=Points(keypoints=rng.uniform(0, 256, (KEYPOINTS, 2)).astype(np.float32)),
             size=(256, 256),
             descriptors=rng.normal(size=(KEYPOINTS, 128)).astype(np.float32),
         )
@@ -29,25 +29,25 @@ def batch(rng: np.random.Generator, count: int = BATCH) -> tuple[Points, torch.T
     return points, torch.from_numpy(rng.random((count, 3, 256, 256)).astype(np.float32))
 
 
-def test_the_average_follows_the_weights_and_forgets_slowly(rng):
-    """After the first steps the average is what its rule makes of the weights that were seen."""
+def test_the_average_follows_its_formula(rng):
+    """After the first steps the average follows its formula."""
     learner = Learner(Inverter(Shape(inputs=130, widths=(8, 8))), Training(steps=3, batch=1, warmup=1))
     name = "own.weight"
     expected = learner.module.state_dict()[name].clone()
     for step in range(3):
-        learner.learn(*batch(rng, 1), done=step / 3)
-        keep = (step + 1) / (step + 10)
-        expected = keep * expected + (1 - keep) * learner.module.state_dict()[name]
+        learner.learn(*batch(rng, 1), progress=step / 3)
+        decay = (step + 1) / (step + 10)
+        expected = decay * expected + (1 - decay) * learner.module.state_dict()[name]
     torch.testing.assert_close(learner.average[name], expected)
     last = learner.module.state_dict()[name].clone()
-    assert not torch.equal(learner.averaged().state_dict()[name], last)
+    assert not torch.equal(learner.load_average().state_dict()[name], last)
 
 
-def test_the_rate_rises_and_then_falls_to_nothing(rng):
+def test_the_rate_rises_and_then_falls_to_zero(rng):
     learner = Learner(Inverter(Shape(inputs=130, widths=(8, 8))), Training(steps=9, batch=1, warmup=2, rate=1e-3))
     rates = []
-    for done in (-1.0, -0.5, 0.0, 0.5, 1.0):
-        learner.learn(*batch(rng, 1), done=done)
+    for progress in (-1.0, -0.5, 0.0, 0.5, 1.0):
+        learner.learn(*batch(rng, 1), progress=progress)
         rates.append(learner.optimizer.rate)
     assert rates == pytest.approx([5e-4, 1e-3, 1e-3, 5e-4, 0])
 
@@ -61,16 +61,16 @@ def ready(rng):
     torch.manual_seed(0)
     learner, given = Learner(Inverter(Shape(inputs=130)), Training()), batch(rng)
     with FlopCounterMode(display=False) as counted:
-        learner.learn(*given, done=0)
+        learner.learn(*given, progress=0)
     return learner, given, counted.get_total_flops()
 
 
 @GROUP
 def test_speed_of_a_step(benchmark, ready):
-    """Eight crops, forward and backward; 8 divided by the seconds is images a second."""
+    """Eight crops, forward and backward; 8 divided by the seconds is images per second."""
     learner, given, operations = ready
     benchmark.extra_info["operations"] = operations
-    benchmark(learner.learn, *given, done=0)
+    benchmark(learner.learn, *given, progress=0)
 
 
 @GROUP

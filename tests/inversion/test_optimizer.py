@@ -24,7 +24,7 @@ def learn(module, optimizer, seed):
     optimizer.step()
 
 
-def before_and_after(module, optimizer):
+def take_step(module, optimizer):
     """Weights before a step, gradients, weights after it."""
     before = {name: weight.detach().clone() for name, weight in module.named_parameters()}
     learn(module, optimizer, 0)
@@ -34,7 +34,7 @@ def before_and_after(module, optimizer):
 
 def test_each_direction_of_a_matrix_moves_about_equally_far(module):
     """Also of a convolution. The gradient's own directions differ more than that (control)."""
-    before, gradients, after = before_and_after(module, Optimizer(module, RATE, decay=0.0))
+    before, gradients, after = take_step(module, Optimizer(module, RATE, decay=0.0))
     for name in MATRICES:
         moved, gradient = (before[name] - after[name]).flatten(1), gradients[name].flatten(1)
         far = torch.linalg.svdvals(moved) / (0.2 * RATE * max(moved.shape) ** 0.5)
@@ -44,9 +44,9 @@ def test_each_direction_of_a_matrix_moves_about_equally_far(module):
         assert own.max() > 5 * own.min()
 
 
-def test_a_convolution_moves_as_the_matrix_that_it_is(module):
-    """PyTorch's Muon of that matrix, in the order of columns that flattening gives, is the reference."""
-    before, gradients, after = before_and_after(module, Optimizer(module, RATE, DECAY))
+def test_a_convolution_is_updated_as_a_matrix(module):
+    """The reference is PyTorch's Muon on the flattened weight."""
+    before, gradients, after = take_step(module, Optimizer(module, RATE, DECAY))
     for name in MATRICES:
         reference = nn.Parameter(before[name].flatten(1).clone())
         reference.grad = gradients[name].flatten(1).clone()
@@ -55,8 +55,8 @@ def test_a_convolution_moves_as_the_matrix_that_it_is(module):
         assert (after[name] - before[name]).abs().max() > 0.1 * RATE
 
 
-def test_what_is_no_matrix_moves_by_adamw(module):
-    before, gradients, after = before_and_after(module, Optimizer(module, RATE, DECAY))
+def test_weights_that_are_no_matrix_follow_adamw(module):
+    before, gradients, after = take_step(module, Optimizer(module, RATE, DECAY))
     for name in ("0.bias", "1.weight", "1.bias", "4.bias"):
         reference = nn.Parameter(before[name].clone())
         reference.grad = gradients[name].clone()
@@ -65,8 +65,8 @@ def test_what_is_no_matrix_moves_by_adamw(module):
 
 
 @pytest.mark.parametrize("restored", [True, False])
-def test_what_goes_on_from_a_state_is_the_same(module, restored):
-    """Without the state it is not (control)."""
+def test_a_restored_state_gives_the_same_steps(module, restored):
+    """Not so without the state (control)."""
     optimizer = Optimizer(module, RATE, DECAY)
     for seed in range(3):
         learn(module, optimizer, seed)
@@ -87,10 +87,10 @@ def test_what_goes_on_from_a_state_is_the_same(module, restored):
     assert restored or not any(same)
 
 
-def test_the_rate_is_that_of_both(module):
+def test_the_rate_is_shared_by_both(module):
     optimizer = Optimizer(module, RATE, DECAY)
     optimizer.rate = 0.0
-    before, _, after = before_and_after(module, optimizer)
+    before, _, after = take_step(module, optimizer)
     assert optimizer.rate == 0
     for name, weight in before.items():
         torch.testing.assert_close(after[name], weight, rtol=0, atol=0)

@@ -1,4 +1,4 @@
-"""Training on several devices: what two processes compute is what one computes of the joint batch."""
+"""Training on several devices: two processes compute the same as one with the whole batch."""
 
 import os
 
@@ -14,41 +14,41 @@ from bench.extractors.sift import Sift
 from bench.images import photographs
 from bench.inversion import learner, norm, reconstruct, weights
 from bench.inversion.plan import PROFILES, Plan, Training
-from bench.inversion.process_group import Team, launch
+from bench.inversion.process_group import ProcessGroup, launch
 from defenses.none import Undefended
 
 pytestmark = pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="two processes need two cores")
 
 
-def normalised(module, images):
-    """Output, gradient of the input for a loss that is no mere sum, and running statistics."""
+def normalise(module, images):
+    """Return output, gradient of the input for a nonlinear loss, running statistics and gradient of the scale."""
     images = images.clone().requires_grad_()
-    painted = module(images)
-    (painted**3).sum().backward()
-    return painted.detach(), images.grad, module.running_mean, module.running_var, module.weight.grad
+    output = module(images)
+    (output**3).sum().backward()
+    return output.detach(), images.grad, module.running_mean, module.running_var, module.weight.grad
 
 
-def one_of_two(rank, folder, jointly):
+def run_half(rank, folder, jointly):
     distributed.init_process_group("gloo", init_method=f"file://{folder}/meet", rank=rank, world_size=2)
     module = nn.Sequential(nn.BatchNorm2d(3, dtype=torch.float64))
     if jointly:
-        norm.joint(module)
+        norm.convert_batch_norms(module)
     part = torch.load(folder / "images")[2 * rank : 2 * rank + 2]
-    torch.save(normalised(module[0], part), folder / f"found-{rank}")
+    torch.save(normalise(module[0], part), folder / f"found-{rank}")
     distributed.destroy_process_group()
 
 
 @pytest.mark.parametrize("jointly", [True, False])
 def test_batch_norm_is_over_the_batch_of_both_processes(jointly, tmp_path):
-    """And PyTorch's own, over each process's part, is something else (negative control)."""
+    """PyTorch's own, over each process's part, differs (negative control)."""
     torch.manual_seed(0)
     images = torch.randn(4, 3, 5, 6, dtype=torch.float64) + torch.arange(4)[:, None, None, None]
     torch.save(images, tmp_path / "images")
-    torch.multiprocessing.spawn(one_of_two, (tmp_path, jointly), nprocs=2)
+    torch.multiprocessing.spawn(run_half, (tmp_path, jointly), nprocs=2)
     first, second = (torch.load(tmp_path / f"found-{rank}") for rank in range(2))
-    painted, gradient, mean, variance, scale = normalised(nn.BatchNorm2d(3, dtype=torch.float64), images)
+    output, gradient, mean, variance, scale = normalise(nn.BatchNorm2d(3, dtype=torch.float64), images)
     together = [
-        (torch.cat([first[0], second[0]]), painted),
+        (torch.cat([first[0], second[0]]), output),
         (torch.cat([first[1], second[1]]), gradient),
         (first[2], mean),
         (second[2], mean),
@@ -59,34 +59,34 @@ def test_batch_norm_is_over_the_batch_of_both_processes(jointly, tmp_path):
     assert all(same) if jointly else not any(same)
 
 
-def losses(folder):
+def read_losses(folder):
     events = EventAccumulator(str(folder))
     events.Reload()
     return np.array([event.value for event in events.Scalars("loss")])
 
 
-def in_single_precision(*given):
-    """Train and paint without half-precision's rounding, which grows from step to step."""
+def train_in_single_precision(*given):
+    """Train and reconstruct without rounding to half precision, which grows from step to step."""
     learner.pick_dtype = reconstruct.pick_dtype = lambda device: torch.float32
-    return inversion.take_part(*given)
+    return inversion.train_worker(*given)
 
 
-def put_back(monkeypatch):
+def restore_after_test(monkeypatch):
     for module in (learner, reconstruct):
         monkeypatch.setattr(module, "pick_dtype", module.pick_dtype)
 
 
-def without_joint_norms(*given):
-    norm.joint = lambda module: None  # in a process of its own
-    return in_single_precision(*given)
+def train_without_joint_norms(*given):
+    norm.convert_batch_norms = lambda module: None  # in a process of its own
+    return train_in_single_precision(*given)
 
 
-def asked(folder, name):
-    """What `take_part` is told after the team."""
-    sources = photographs.builtin()
+def build_arguments(folder, name):
+    """Build the arguments of `train_worker` after the group."""
+    sources = photographs.list_builtin()
     plan = Plan(
         defense=Undefended(),
-        served={},
+        supported_settings={},
         photographs=sources[:2],
         validation=sources[2:3],
         extractor=Sift(),
@@ -96,29 +96,33 @@ def asked(folder, name):
     return plan, folder / name, folder / f"log-{name}"
 
 
-# First steps are signs of gradients, or orthogonal: rounding turns what is small in gradients, which does little at a low rate.
+# First steps are signs of gradients, or orthogonal, so rounding changes the smallest parts; at a low rate this has little effect.
 SHORT = Training(steps=4, batch=4, warmup=2, rate=1e-4)
-PROCESSES = {"one": (1, in_single_precision), "two": (2, in_single_precision), "apart": (2, without_joint_norms)}
+PROCESSES = {
+    "one": (1, train_in_single_precision),
+    "two": (2, train_in_single_precision),
+    "separate": (2, train_without_joint_norms),
+}
 
 
-def test_two_processes_train_as_one_with_the_joint_batch(tmp_path, monkeypatch):
+def test_two_processes_train_as_one_with_the_whole_batch(tmp_path, monkeypatch):
     """The same loss at every step, the same scores. Not so if each process normalises its own part (control)."""
-    put_back(monkeypatch)
+    restore_after_test(monkeypatch)
     found = {}
-    for name, (devices, how) in PROCESSES.items():
-        meta = launch(devices, SHORT.batch, how, *asked(tmp_path, name))
-        found[name] = losses(tmp_path / f"log-{name}"), meta["validation"]["ssim"]
+    for name, (devices, function) in PROCESSES.items():
+        meta = launch(devices, SHORT.batch, function, *build_arguments(tmp_path, name))
+        found[name] = read_losses(tmp_path / f"log-{name}"), meta["validation"]["ssim"]
     assert len(found["two"][0]) == SHORT.steps
     np.testing.assert_allclose(found["two"][0], found["one"][0], rtol=1e-5)
     assert found["two"][1] == pytest.approx(found["one"][1], abs=1e-5)
-    assert np.abs(found["apart"][0] / found["one"][0] - 1).max() > 1e-4
+    assert np.abs(found["separate"][0] / found["one"][0] - 1).max() > 1e-4
     one, two = (weights.load(tmp_path / name) for name in ("one", "two"))
     assert one.meta.keys() == two.meta.keys()
     assert not list(tmp_path.glob("*.checkpoint"))
 
 
-def test_two_processes_go_on_from_what_one_left(tmp_path, monkeypatch):
-    put_back(monkeypatch)
+def test_two_processes_resume_the_training_of_one(tmp_path, monkeypatch):
+    restore_after_test(monkeypatch)
     monkeypatch.setattr(inversion, "CHECKPOINT_EVERY", 1)
     advance = inversion._Trainer._advance
 
@@ -127,39 +131,39 @@ def test_two_processes_go_on_from_what_one_left(tmp_path, monkeypatch):
             raise KeyboardInterrupt
         return advance(self, *given)
 
-    launch(1, SHORT.batch, in_single_precision, *asked(tmp_path, "whole"))
+    launch(1, SHORT.batch, train_in_single_precision, *build_arguments(tmp_path, "whole"))
     monkeypatch.setattr(inversion._Trainer, "_advance", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        launch(1, SHORT.batch, in_single_precision, *asked(tmp_path, "parts"))
-    launch(2, SHORT.batch, in_single_precision, *asked(tmp_path, "parts"))
-    assert len(losses(tmp_path / "log-parts")) == SHORT.steps  # two steps of one, two of both
-    np.testing.assert_allclose(losses(tmp_path / "log-parts"), losses(tmp_path / "log-whole"), rtol=1e-5)
+        launch(1, SHORT.batch, train_in_single_precision, *build_arguments(tmp_path, "parts"))
+    launch(2, SHORT.batch, train_in_single_precision, *build_arguments(tmp_path, "parts"))
+    assert len(read_losses(tmp_path / "log-parts")) == SHORT.steps  # two steps of one, two of both
+    np.testing.assert_allclose(read_losses(tmp_path / "log-parts"), read_losses(tmp_path / "log-whole"), rtol=1e-5)
 
 
-def test_a_users_mistake_in_a_process_is_told_in_one_line(tmp_path, capsys):
+def test_a_user_error_in_a_process_is_reported_in_one_line(tmp_path, capsys):
     folder = tmp_path / "photos"
     folder.mkdir()
-    (folder / "a.png").write_bytes(photographs.builtin()[0].path.read_bytes())
+    (folder / "a.png").write_bytes(photographs.list_builtin()[0].path.read_bytes())
     command = ["train", "--defense", "none", "--images", str(folder), "--validation", str(folder), "--out", str(tmp_path / "W")]
     assert main([*command, "--devices", "2"]) == 2
     assert capsys.readouterr().err.splitlines()[-1].endswith("1 photographs are in both the training and the validation set")
 
 
 @pytest.mark.parametrize(
-    ("words", "message"), [(("--devices", "4096"), "from 1 to"), (("--devices", "2", "--batch", "3"), "a multiple of 2")]
+    ("words", "message"), [(("--devices", "4096"), "must be from 1 to"), (("--devices", "2", "--batch", "3"), "a multiple of 2")]
 )
-def test_devices_that_are_not_there_or_cannot_share(words, message, tmp_path, capsys):
+def test_missing_devices_and_unequal_parts_are_refused(words, message, tmp_path, capsys):
     folder = tmp_path / "photos"
     folder.mkdir()
-    for source in photographs.builtin()[:2]:
+    for source in photographs.list_builtin()[:2]:
         (folder / source.path.name).write_bytes(source.path.read_bytes())
     assert main(["train", "--defense", "none", "--images", str(folder), "--out", str(tmp_path / "W"), *words]) == 2
     assert message in capsys.readouterr().err
 
 
-def test_parts_make_the_batch():
-    assert [place for rank in range(3) for place in Team(rank, 3).part(12)] == list(range(12))
-    assert list(Team().part(5)) == list(range(5))
+def test_the_parts_form_the_batch():
+    assert [index for rank in range(3) for index in ProcessGroup(rank, 3).assign_indices(12)] == list(range(12))
+    assert list(ProcessGroup().assign_indices(5)) == list(range(5))
 
 
 def test_the_papers_profile_has_coarsenets_widths():

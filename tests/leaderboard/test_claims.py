@@ -1,4 +1,4 @@
-"""Verdicts: bootstrap against SciPy and enumeration, and claims that hold, fail and cannot be told on made-up numbers."""
+"""Verdicts: the bootstrap against SciPy and enumeration, and claims that hold, fail or stay open on made-up numbers."""
 
 import dataclasses
 import itertools
@@ -14,10 +14,10 @@ from bench.codebook.public import Public
 from bench.extractors.sift import Sift
 from bench.mechanisms.subset import log10_chance
 from defenses.ldp import LDP
-from leaderboard.intervals import RESAMPLES, independent, interval, rank_correlation
+from leaderboard.intervals import RESAMPLES, combine_independent, interval, rank_correlation
 from leaderboard.reproduce import scale, tables
 from leaderboard.reproduce.claims import (
-    FEWEST,
+    MIN_SAMPLES,
     Claim,
     Statement,
     Verdict,
@@ -25,11 +25,11 @@ from leaderboard.reproduce.claims import (
     at_least,
     falling,
     greater,
-    judge,
+    judge_claims,
     same_order,
 )
 from leaderboard.reproduce.profiles import CPU, PROFILES, Materials, Setting
-from leaderboard.reproduce.study import printed
+from leaderboard.reproduce.study import collect_paper_values
 from leaderboard.reproduce.tables import table2, table3, table4
 
 A, B = ("a", "ssim"), ("b", "ssim")
@@ -41,11 +41,11 @@ SETTING = Setting(profile=CPU, materials=Materials(), extractor=Sift(), photogra
 
 def test_interval_is_that_of_scipy(rng: np.random.Generator) -> None:
     values = rng.gamma(2.0, size=30)
-    theirs = stats.bootstrap((values,), np.mean, n_resamples=RESAMPLES, method="percentile", rng=1).confidence_interval
+    reference = stats.bootstrap((values,), np.mean, n_resamples=RESAMPLES, method="percentile", rng=1).confidence_interval
     ours = interval(values)
     error = values.std() / math.sqrt(len(values))
     assert ours.mean == pytest.approx(values.mean())
-    assert (ours.low, ours.high) == pytest.approx((theirs.low, theirs.high), abs=0.1 * error)
+    assert (ours.low, ours.high) == pytest.approx((reference.low, reference.high), abs=0.1 * error)
 
 
 def test_interval_is_that_of_all_resamples(rng: np.random.Generator) -> None:
@@ -54,9 +54,9 @@ def test_interval_is_that_of_all_resamples(rng: np.random.Generator) -> None:
     assert (interval(values).low, interval(values).high) == pytest.approx(np.quantile(means, (0.025, 0.975)), abs=0.05)
 
 
-def test_intervals_cover_the_mean_about_as_often_as_they_say(rng: np.random.Generator) -> None:
-    found = [interval(sample) for sample in rng.normal(size=(100, 40))]
-    assert 0.88 < np.mean([one.low < 0 < one.high for one in found]) < 0.99
+def test_intervals_cover_the_mean_at_their_level(rng: np.random.Generator) -> None:
+    intervals = [interval(sample) for sample in rng.normal(size=(100, 40))]
+    assert 0.88 < np.mean([one.low < 0 < one.high for one in intervals]) < 0.99
 
 
 def test_one_photograph_has_no_interval() -> None:
@@ -77,54 +77,54 @@ def test_rank_correlation_is_that_of_scipy(rng: np.random.Generator, ties: bool)
 PHOTOGRAPHS = 20
 
 
-def made_up(means: Mapping[str, float], spread: float, shared: float = 0.0) -> pd.DataFrame:
-    """SSIM of rows on photographs: `spread` of each by itself, `shared` by all rows of a photograph."""
+def sample_values(means: Mapping[str, float], spread: float, common_spread: float = 0.0) -> pd.DataFrame:
+    """Return SSIM of rows on photographs: `spread` per value, `common_spread` per photograph."""
     rng = np.random.default_rng(0)
-    common = shared * rng.normal(size=PHOTOGRAPHS)
+    common = common_spread * rng.normal(size=PHOTOGRAPHS)
     return pd.DataFrame({(row, "ssim"): mean + common + spread * rng.normal(size=PHOTOGRAPHS) for row, mean in means.items()})
 
 
-def verdict(statement: Statement, values: pd.DataFrame) -> Verdict:
-    (finding,) = judge([Claim(text="a claim", statements=(statement,))], values, {}, {})
-    return finding.verdict
+def find_verdict(statement: Statement, values: pd.DataFrame) -> Verdict:
+    (result,) = judge_claims([Claim(text="a claim", statements=(statement,))], values, {}, {})
+    return result.verdict
 
 
-def test_an_order_holds_fails_and_cannot_be_told() -> None:
-    assert verdict(greater(A, B), made_up({"a": 0.6, "b": 0.5}, 0.02)) is Verdict.HOLDS
-    assert verdict(greater(A, B), made_up({"a": 0.5, "b": 0.6}, 0.02)) is Verdict.FAILS
-    assert verdict(greater(A, B), made_up({"a": 0.6, "b": 0.599}, 0.2)) is Verdict.OPEN
+def test_an_order_holds_fails_or_stays_open() -> None:
+    assert find_verdict(greater(A, B), sample_values({"a": 0.6, "b": 0.5}, 0.02)) is Verdict.HOLDS
+    assert find_verdict(greater(A, B), sample_values({"a": 0.5, "b": 0.6}, 0.02)) is Verdict.FAILS
+    assert find_verdict(greater(A, B), sample_values({"a": 0.6, "b": 0.599}, 0.2)) is Verdict.OPEN
 
 
-def test_pairing_tells_what_means_alone_do_not() -> None:
-    """Photographs differ far more than rows do. Shuffled, so that the pairs are lost, nothing can be told."""
-    values = made_up({"a": 0.51, "b": 0.5}, 0.002, shared=0.2)
-    assert verdict(greater(A, B), values) is Verdict.HOLDS
+def test_pairing_decides_where_means_alone_do_not() -> None:
+    """Photographs differ far more than rows do. Shuffling destroys the pairs, and the verdict is open."""
+    values = sample_values({"a": 0.51, "b": 0.5}, 0.002, common_spread=0.2)
+    assert find_verdict(greater(A, B), values) is Verdict.HOLDS
     values[A] = np.random.default_rng(1).permutation(values[A])
-    assert verdict(greater(A, B), values) is Verdict.OPEN
+    assert find_verdict(greater(A, B), values) is Verdict.OPEN
 
 
 def test_slack_and_equality() -> None:
-    behind = made_up({"a": 0.495, "b": 0.5}, 0.002)
-    assert verdict(at_least(A, B, 0.01), behind) is Verdict.HOLDS
-    assert verdict(greater(A, B), behind) is Verdict.FAILS
-    assert verdict(at_least(A, B, 0.001), behind) is Verdict.FAILS
-    assert verdict(about_equal(A, B, 0.03), behind) is Verdict.HOLDS
-    assert verdict(about_equal(A, B, 0.03), made_up({"a": 0.6, "b": 0.5}, 0.002)) is Verdict.FAILS
-    assert verdict(about_equal(A, B, 0.03), made_up({"a": 0.4, "b": 0.5}, 0.002)) is Verdict.FAILS
-    assert verdict(about_equal(A, B, 0.03), made_up({"a": 0.5, "b": 0.5}, 0.2)) is Verdict.OPEN
+    behind = sample_values({"a": 0.495, "b": 0.5}, 0.002)
+    assert find_verdict(at_least(A, B, 0.01), behind) is Verdict.HOLDS
+    assert find_verdict(greater(A, B), behind) is Verdict.FAILS
+    assert find_verdict(at_least(A, B, 0.001), behind) is Verdict.FAILS
+    assert find_verdict(about_equal(A, B, 0.03), behind) is Verdict.HOLDS
+    assert find_verdict(about_equal(A, B, 0.03), sample_values({"a": 0.6, "b": 0.5}, 0.002)) is Verdict.FAILS
+    assert find_verdict(about_equal(A, B, 0.03), sample_values({"a": 0.4, "b": 0.5}, 0.002)) is Verdict.FAILS
+    assert find_verdict(about_equal(A, B, 0.03), sample_values({"a": 0.5, "b": 0.5}, 0.2)) is Verdict.OPEN
 
 
-def test_cells_of_different_units_are_compared_by_independent_resampling() -> None:
-    """Day and night have other queries: paired, nothing could be told."""
+def test_entries_of_different_samples_are_compared_by_independent_resampling() -> None:
+    """Day and night have different queries; paired by query, the verdict would be open."""
     rng = np.random.default_rng(3)
     day = pd.Series((rng.random(200) < 0.8).astype(float), index=[f"day {number}" for number in range(200)])
     night = pd.Series((rng.random(100) < 0.3).astype(float), index=[f"night {number}" for number in range(100)])
     values = pd.DataFrame({A: day, B: night})
     unpaired = Statement(text="", weights={A: 1.0, B: -1.0}, above=0.0, paired=False)
-    assert verdict(unpaired, values) is Verdict.HOLDS
-    assert verdict(dataclasses.replace(unpaired, weights={A: -1.0, B: 1.0}), values) is Verdict.FAILS
-    assert verdict(dataclasses.replace(unpaired, paired=True), values) is Verdict.OPEN
-    ours = independent([day, night], [1.0, -1.0])
+    assert find_verdict(unpaired, values) is Verdict.HOLDS
+    assert find_verdict(dataclasses.replace(unpaired, weights={A: -1.0, B: 1.0}), values) is Verdict.FAILS
+    assert find_verdict(dataclasses.replace(unpaired, paired=True), values) is Verdict.OPEN
+    ours = combine_independent([day, night], [1.0, -1.0])
     expected = stats.bootstrap((day, night), lambda x, y: x.mean() - y.mean(), method="percentile", random_state=1)
     assert ours.mean == pytest.approx(day.mean() - night.mean())
     assert (ours.low, ours.high) == pytest.approx(tuple(expected.confidence_interval), abs=0.01)
@@ -132,32 +132,32 @@ def test_cells_of_different_units_are_compared_by_independent_resampling() -> No
 
 
 def test_few_photographs_decide_nothing() -> None:
-    clear = made_up({"a": 0.9, "b": 0.1}, 0.001)
-    assert verdict(greater(A, B), clear.head(FEWEST)) is Verdict.HOLDS
-    assert verdict(greater(A, B), clear.head(FEWEST - 1)) is Verdict.OPEN
+    clear = sample_values({"a": 0.9, "b": 0.1}, 0.001)
+    assert find_verdict(greater(A, B), clear.head(MIN_SAMPLES)) is Verdict.HOLDS
+    assert find_verdict(greater(A, B), clear.head(MIN_SAMPLES - 1)) is Verdict.OPEN
 
 
-def test_only_photographs_that_have_all_cells_count() -> None:
-    values = made_up({"a": 0.6, "b": 0.5}, 0.001)
+def test_only_photographs_with_all_entries_count() -> None:
+    values = sample_values({"a": 0.6, "b": 0.5}, 0.001)
     values.loc[0, [A]] = 99.0
     values.loc[0, [B]] = np.nan
-    (finding,) = judge([Claim(text="", statements=(greater(A, B),))], values, {}, {})
-    ours = finding.evidence[0].ours
+    (result,) = judge_claims([Claim(text="", statements=(greater(A, B),))], values, {}, {})
+    ours = result.evidence[0].ours
     assert ours is not None
     assert ours.count == PHOTOGRAPHS - 1
     assert ours.high < 1
 
 
-def test_a_row_that_does_not_apply_leaves_the_claim_open_and_says_why() -> None:
-    values = made_up({"a": 0.6}, 0.001)
-    (finding,) = judge([Claim(text="", statements=(greater(A, B),))], values, {A: 2.0, B: 1.0}, {"b": "n/a: no network"})
-    assert finding.verdict is Verdict.OPEN
-    assert finding.evidence[0].paper == 1.0
-    assert finding.evidence[0].reason == "b: n/a: no network"
+def test_a_row_that_does_not_apply_leaves_the_claim_open_with_a_reason() -> None:
+    values = sample_values({"a": 0.6}, 0.001)
+    (result,) = judge_claims([Claim(text="", statements=(greater(A, B),))], values, {A: 2.0, B: 1.0}, {"b": "n/a: no network"})
+    assert result.verdict is Verdict.OPEN
+    assert result.evidence[0].paper == 1.0
+    assert result.evidence[0].reason == "b: n/a: no network"
 
 
 def test_a_claim_fails_with_one_statement_and_holds_with_all() -> None:
-    values = made_up({"a": 0.6, "b": 0.5, "c": 0.4, "d": 0.4}, 0.001)
+    values = sample_values({"a": 0.6, "b": 0.5, "c": 0.4, "d": 0.4}, 0.001)
     c, d, missing = ("c", "ssim"), ("d", "ssim"), ("e", "ssim")
     cases = {
         Verdict.HOLDS: falling([A, B, c]),
@@ -165,54 +165,54 @@ def test_a_claim_fails_with_one_statement_and_holds_with_all() -> None:
         Verdict.OPEN: (*falling([A, B]), greater(missing, A)),
     }
     for expected, statements in cases.items():
-        (finding,) = judge([Claim(text="", statements=statements)], values, {}, {})
-        assert finding.verdict is expected
-    assert verdict(Statement(text="", weights={A: 1.0, B: -1.0, c: -1.0, d: 1.0}, below=0.11), values) is Verdict.HOLDS
+        (result,) = judge_claims([Claim(text="", statements=statements)], values, {}, {})
+        assert result.verdict is expected
+    assert find_verdict(Statement(text="", weights={A: 1.0, B: -1.0, c: -1.0, d: 1.0}, below=0.11), values) is Verdict.HOLDS
 
 
-def test_same_order_is_asked_of_the_pairs_that_are_far_enough_apart() -> None:
+def test_same_order_uses_only_pairs_that_differ_enough() -> None:
     paper = {A: 0.5, B: 0.52, ("c", "ssim"): 0.6}
     claim = same_order(paper, 0.03, "SSIM")
     assert [list(statement.weights) for statement in claim.statements] == [[("c", "ssim"), A], [("c", "ssim"), B]]
-    (finding,) = judge([claim], made_up({"a": 0.7, "b": 0.5, "c": 0.6}, 0.001), paper, {})
-    assert [evidence.verdict for evidence in finding.evidence] == [Verdict.FAILS, Verdict.HOLDS]
+    (result,) = judge_claims([claim], sample_values({"a": 0.7, "b": 0.5, "c": 0.6}, 0.001), paper, {})
+    assert [evidence.verdict for evidence in result.evidence] == [Verdict.FAILS, Verdict.HOLDS]
 
 
 # ---- the tables
 
 
-@pytest.mark.parametrize("name", sorted(tables.everything()))
-def test_the_paper_keeps_its_own_claims(name: str) -> None:
-    """Had each photograph the paper's values, every claim would hold; were all values negated, none that has a direction."""
-    table = tables.everything()[name]
-    rows = (*table.rows(SETTING), *table.borrowed(SETTING))
+@pytest.mark.parametrize("name", sorted(tables.load_tables()))
+def test_the_papers_values_satisfy_its_claims(name: str) -> None:
+    """With the paper's values for each photograph every claim holds; with negated values no claim with a direction does."""
+    table = tables.load_tables()[name]
+    rows = (*table.build_rows(SETTING), *table.build_reference_rows(SETTING))
     assert len({row.name for row in rows}) == len(rows)
-    values = printed(rows)
-    claims = table.claims(values)
+    values = collect_paper_values(rows)
+    claims = table.build_claims(values)
     for sign, expected in ((1, Verdict.HOLDS), (-1, Verdict.FAILS)):
-        alike = pd.DataFrame({cell: [sign * value] * FEWEST for cell, value in values.items()})
-        wrong = [finding.claim.text for finding in judge(claims, alike, values, {}) if finding.verdict is not expected]
+        equal = pd.DataFrame({entry: [sign * value] * MIN_SAMPLES for entry, value in values.items()})
+        wrong = [result.claim.text for result in judge_claims(claims, equal, values, {}) if result.verdict is not expected]
         assert wrong == [text for text in wrong if sign == -1 and ("flat" in text or "equals" in text)]
 
 
 def test_claims_about_structure_fail_where_they_should() -> None:
-    """Had m = 4 the points of m = 32, and quantised descriptors more than raw ones, those two claims would fall, and no other."""
-    rows = tables.everything()["tableS2"].rows(SETTING)
-    paper = printed(rows)
+    """Swapping the points of m = 4 and m = 32, and more points with quantisation than raw, refutes two claims and no other."""
+    rows = tables.load_tables()["tableS2"].build_rows(SETTING)
+    paper = collect_paper_values(rows)
     wrong = dict(paper)
     wrong["m 4", "points"], wrong["m 32", "points"] = paper["m 32", "points"], paper["m 4", "points"]
     wrong["no privacy", "points"] = 1.1 * paper["raw", "points"]
-    _, *claims = tables.everything()["tableS2"].claims(paper)  # the first is about every pair
-    alike = pd.DataFrame({cell: [value] * FEWEST for cell, value in wrong.items()})
-    failed = [finding.claim.text for finding in judge(claims, alike, paper, {}) if finding.verdict is not Verdict.HOLDS]
+    _, *claims = tables.load_tables()["tableS2"].build_claims(paper)  # the first is about every pair
+    equal = pd.DataFrame({entry: [value] * MIN_SAMPLES for entry, value in wrong.items()})
+    failed = [result.claim.text for result in judge_claims(claims, equal, paper, {}) if result.verdict is not Verdict.HOLDS]
     assert [text.partition(":")[0] for text in failed] == [
         "Quantisation alone, without privacy, loses points.",
         "An interior m is near best",
     ]
 
 
-def test_structure_s_dictionaries_tell_the_truth_as_often_as_the_papers() -> None:
-    for row in tables.everything()["tableS2"].rows(SETTING)[2:]:
+def test_structure_defenses_release_the_true_word_with_the_papers_probability() -> None:
+    for row in tables.load_tables()["tableS2"].build_rows(SETTING)[2:]:
         defense = row.defense
         assert isinstance(defense, LDP)
         ours = log10_chance(defense.epsilon, defense.words, defense.subset_size)
@@ -225,20 +225,20 @@ def test_structure_s_dictionaries_tell_the_truth_as_often_as_the_papers() -> Non
 
 @pytest.mark.parametrize("factor", [profile.scale for profile in PROFILES.values()] + [1 / 8])
 @pytest.mark.parametrize(("words", "epsilon", "subset"), [(256_000, 16, 1), (256_000, 10, 4), (512_000, 12, 4)])
-def test_the_scale_keeps_the_chance_of_the_truth(factor: float, words: int, epsilon: float, subset: int) -> None:
-    def chance(size: float, budget: float) -> float:
+def test_the_scale_keeps_the_probability_of_the_true_word(factor: float, words: int, epsilon: float, subset: int) -> None:
+    def probability(size: float, budget: float) -> float:
         return subset * math.exp(budget) / (subset * math.exp(budget) + size - subset)
 
-    ours = chance(scale.words(words, factor), scale.epsilon(epsilon, factor))
-    assert ours == pytest.approx(chance(words, epsilon), rel=5 * subset / (factor * words))
-    if factor != 1:  # the controls: without the shift, and with the shift to the wrong side
+    ours = probability(scale.words(words, factor), scale.epsilon(epsilon, factor))
+    assert ours == pytest.approx(probability(words, epsilon), rel=5 * subset / (factor * words))
+    if factor != 1:  # controls: no shift, and a shift of the wrong sign
         for wrong in (epsilon, epsilon - math.log(factor)):
-            assert chance(scale.words(words, factor), wrong) != pytest.approx(chance(words, epsilon), rel=1e-3)
+            assert probability(scale.words(words, factor), wrong) != pytest.approx(probability(words, epsilon), rel=1e-3)
 
 
-def test_the_defenses_of_table_4_tell_the_truth_as_often_as_the_papers() -> None:
+def test_table_4_defenses_release_the_true_word_with_the_papers_probability() -> None:
     public = Public()
-    for row in table4.rows(SETTING):
+    for row in table4.build_rows(SETTING):
         words, epsilon, subset = (float(row.labels[column].replace(",", "")) for column in ("|K|", "ε", "m"))
         privacy = row.defense.privacy(public)
         expected = subset * math.exp(epsilon) / (subset * math.exp(epsilon) + words - subset)
@@ -247,21 +247,22 @@ def test_the_defenses_of_table_4_tell_the_truth_as_often_as_the_papers() -> None
         assert privacy.epsilon == pytest.approx(epsilon - math.log(2))
 
 
-def test_the_trials_of_table_3_are_those_of_the_issue() -> None:
-    """10M, 1M, 100k and 10k of the paper's; of profile cpu as many as two cores can make."""
+def test_table_3_has_the_specified_trials() -> None:
+    """Profile paper: the paper's 10M, 1M, 100k and 10k. Profile cpu: as many as two cores can run."""
     settings = {name: dataclasses.replace(SETTING, profile=profile) for name, profile in PROFILES.items()}
-    made = {
-        name: {row.name: dataclasses.asdict(row.task)["trials"] for row in table3.rows(own)} for name, own in settings.items()
+    trials = {
+        name: {row.name: dataclasses.asdict(row.task)["trials"] for row in table3.build_rows(setting)}
+        for name, setting in settings.items()
     }
-    assert [made["paper"][row] for row in table3.TRIALS] == [10_000_000, 1_000_000, 100_000, 10_000]
-    assert [made["cpu"][row] for row in table3.TRIALS] == [100_000, 30_000, 10_000, 3_000]
-    assert [made["smoke"][row] for row in table3.TRIALS] == [3_333, 1_000, 333, 100]
-    assert made["cpu"]["voc-match"] == 30_000
+    assert [trials["paper"][row] for row in table3.TRIALS] == [10_000_000, 1_000_000, 100_000, 10_000]
+    assert [trials["cpu"][row] for row in table3.TRIALS] == [100_000, 30_000, 10_000, 3_000]
+    assert [trials["smoke"][row] for row in table3.TRIALS] == [3_333, 1_000, 333, 100]
+    assert trials["cpu"]["voc-match"] == 30_000
 
 
 def test_table_3_shares_the_row_of_its_point_with_table_2() -> None:
-    point = next(row for row in table2.rows(SETTING) if row.name == "|K| 256k, ε 10, m 2")
-    own = {row.name: row for row in table3.rows(SETTING)}
+    point = next(row for row in table2.build_rows(SETTING) if row.name == "|K| 256k, ε 10, m 2")
+    own = {row.name: row for row in table3.build_rows(SETTING)}
     for name in ("voc-match", "Aachen Ref.", "1M"):
         assert (own[name].defense, own[name].task) == (point.defense, point.task)
     assert own["mutual-nn"].task != point.task

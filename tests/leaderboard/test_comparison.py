@@ -9,20 +9,20 @@ from fabricated import DIA, ENVIRONMENT, GALLERY, PHOTOGRAPHS, SETTINGS, inappli
 
 from bench.core.errors import UserError
 from leaderboard import comparison, group_tables
-from leaderboard.comparison import Board
-from leaderboard.measures import measures
-from leaderboard.ranking import Standing, standings
+from leaderboard.comparison import ComparisonGroup
+from leaderboard.measures import list_measures
+from leaderboard.ranking import Standing, rank_defenses
 
 NONE = {"name": "none"}
 NEAREST = {"name": "nearest"}
 
 
-def made(tmp_path: Path, *groups: list[dict[str, Any]]) -> list[Board]:
-    return comparison.boards(comparison.find(fabricated.write(tmp_path, [record for group in groups for record in group])))
+def made(tmp_path: Path, *groups: list[dict[str, Any]]) -> list[ComparisonGroup]:
+    return comparison.build_groups(comparison.load_records(fabricated.write(tmp_path, [record for group in groups for record in group])))
 
 
-def by_defense(board: Board) -> dict[str, Standing]:
-    return {standing.defense: standing for standing in standings(board)}
+def by_defense(board: ComparisonGroup) -> dict[str, Standing]:
+    return {standing.defense: standing for standing in rank_defenses(board)}
 
 
 # ---- what is told apart
@@ -44,20 +44,20 @@ def test_what_cannot_be_compared_has_a_board_of_its_own(tmp_path: Path, other: d
     found = made(tmp_path, reconstructions(NONE, [0.5]), reconstructions(NONE, [0.9], **other))
     assert len(found) == 2
     assert len({board.key for board in found}) == 2
-    assert [len(board.cells) for board in found] == [1, 1]
+    assert [len(board.experiments) for board in found] == [1, 1]
 
 
 def test_the_name_of_a_dataset_tells_nothing(tmp_path: Path) -> None:
     renamed = PHOTOGRAPHS | {"name": "copy", "spec": None}
     (board,) = made(tmp_path, reconstructions(NONE, [0.5]), reconstructions(ldp(8.0), [0.4], dataset=renamed))
-    assert len(board.cells) == 2
+    assert len(board.experiments) == 2
 
 
 def test_environments_stay_apart_on_one_board(tmp_path: Path) -> None:
     gpu = ENVIRONMENT | {"device": "cuda"}
     (board,) = made(tmp_path, reconstructions(NONE, [0.5]), reconstructions(NONE, [0.6], environment=gpu))
-    assert [cell.attack for cell in board.cells] == ["dia (device cpu)", "dia (device cuda)"]
-    (standing,) = standings(board)  # the defense is one, and the stronger run counts
+    assert [cell.attack for cell in board.experiments] == ["dia (device cpu)", "dia (device cuda)"]
+    (standing,) = rank_defenses(board)  # the defense is one, and the stronger run counts
     assert standing.score is not None
     assert standing.score.mean == 0.6
 
@@ -70,10 +70,10 @@ def test_seeds_have_boards_of_their_own_and_one_of_their_mean(tmp_path: Path) ->
         reconstructions(ldp(8.0), [0.1, 0.1], seed=2),
     )
     assert [board.seeds for board in (averaged, first, second)] == [(1, 2), (1,), (2,)]
-    assert [len(board.cells) for board in (averaged, first, second)] == [1, 1, 2]  # ldp lacks a seed, and is not averaged
-    (ssim,) = measures(["ssim"])
-    assert averaged.values(averaged.cells[0], "ssim") == [pytest.approx(0.4), pytest.approx(0.6)]
-    interval = averaged.average(averaged.cells[0], ssim)
+    assert [len(board.experiments) for board in (averaged, first, second)] == [1, 1, 2]  # ldp lacks a seed, and is not averaged
+    (ssim,) = list_measures(["ssim"])
+    assert averaged.list_values(averaged.experiments[0], "ssim") == [pytest.approx(0.4), pytest.approx(0.6)]
+    interval = averaged.average(averaged.experiments[0], ssim)
     assert interval is not None
     assert interval.count == 2  # photographs, not photographs times seeds
     assert "mean over seeds 1, 2" in averaged.facts
@@ -82,27 +82,27 @@ def test_seeds_have_boards_of_their_own_and_one_of_their_mean(tmp_path: Path) ->
 def test_a_unit_that_one_seed_lacks_is_not_averaged(tmp_path: Path) -> None:
     other = reconstructions(ldp(8.0), [0.3, 0.5], seed=1), reconstructions(ldp(8.0), [0.3, 0.5], seed=2)
     averaged, *_ = made(tmp_path, reconstructions(NONE, [0.5, 0.9], seed=1), reconstructions(NONE, [0.3], seed=2), *other)
-    assert averaged.values(averaged.cells[0], "ssim") == [pytest.approx(0.4)]
-    assert averaged.missing(averaged.cells[0]) == 1
-    assert by_defense(averaged)["none"].unranked == "dia has done 1 of 2"
+    assert averaged.list_values(averaged.experiments[0], "ssim") == [pytest.approx(0.4)]
+    assert averaged.count_missing(averaged.experiments[0]) == 1
+    assert by_defense(averaged)["none"].unranked_reason == "dia has done 1 of 2"
 
 
 def test_records_of_many_folders_are_found_and_the_latest_counts(tmp_path: Path) -> None:
     fabricated.write(tmp_path / "b" / "deep", reconstructions(NONE, [0.8]))
     fabricated.write(tmp_path / "a", reconstructions(NONE, [0.1]))
-    (found,) = comparison.find(tmp_path)
+    (found,) = comparison.load_records(tmp_path)
     assert found.record["metrics"]["ssim"] == 0.8
     assert found.folder == tmp_path / "b" / "deep"
 
 
 def test_no_record_is_a_mistake(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"there is no record in it \(looked for files called records.jsonl\)"):
-        comparison.find(tmp_path)
+        comparison.load_records(tmp_path)
     with pytest.raises(UserError, match="absent: no such file"):
-        comparison.find(tmp_path / "absent")
+        comparison.load_records(tmp_path / "absent")
     (tmp_path / "records.jsonl").write_text("{}\n")
     with pytest.raises(UserError, match=r"records.jsonl, line 1: not a record"):
-        comparison.find(tmp_path)
+        comparison.load_records(tmp_path)
 
 
 # ---- ranking
@@ -117,7 +117,7 @@ def test_a_defense_is_judged_by_the_strongest_attack(tmp_path: Path) -> None:
         reconstructions(affine, [0.6, 0.7], attack=NEAREST),
         reconstructions(ldp(8.0), [0.4, 0.5]),
     )
-    ranked = standings(board)
+    ranked = rank_defenses(board)
     assert [(one.rank, one.defense) for one in ranked] == [(1, "ldp:epsilon=8,subset_size=2"), (2, "affine:dim=4"), (3, "none")]
     assert ranked[1].strongest is not None
     assert ranked[1].strongest.attack == "nearest"  # by dia alone affine would be first
@@ -127,7 +127,7 @@ def test_a_defense_is_judged_by_the_strongest_attack(tmp_path: Path) -> None:
 
 def test_equal_scores_share_a_rank(tmp_path: Path) -> None:
     (board,) = made(tmp_path, *(reconstructions(ldp(eps), [score]) for eps, score in ((1.0, 0.3), (2.0, 0.3), (3.0, 0.4))))
-    assert [one.rank for one in standings(board)] == [1, 1, 3]
+    assert [one.rank for one in rank_defenses(board)] == [1, 1, 3]
 
 
 def test_without_an_adapted_attacker_a_defense_is_unranked_and_last(tmp_path: Path) -> None:
@@ -139,7 +139,7 @@ def test_without_an_adapted_attacker_a_defense_is_unranked_and_last(tmp_path: Pa
         reconstructions({"name": "other"}, [0.02, 0.02], attack=NEAREST),
         reconstructions(NONE, [0.9, 0.9]),
     )
-    assert [(one.rank, one.unranked) for one in standings(board)] == [
+    assert [(one.rank, one.unranked_reason) for one in rank_defenses(board)] == [
         (1, None),
         (None, reason),
         (None, "no adapted attacker was run (dia)"),
@@ -164,7 +164,7 @@ def test_the_mean_of_what_was_left_over_ranks_nobody(tmp_path: Path, attack: dic
     assert found["none"].rank == 1
     standing = next(one for name, one in found.items() if name.startswith("ldp"))
     assert standing.rank is None
-    assert "has done 1 of 2" in str(standing.unranked)
+    assert "has done 1 of 2" in str(standing.unranked_reason)
     notes = [row.note for row in group_tables.pairs(board).rows]
     assert any("1 failed: 1.png: too dark" in note for note in notes)
 
@@ -172,7 +172,7 @@ def test_the_mean_of_what_was_left_over_ranks_nobody(tmp_path: Path, attack: dic
 def test_a_photograph_that_nobody_could_do_holds_against_nobody(tmp_path: Path) -> None:
     broken = [fabricated.record("bad.jpg", {}, defense=d, status="failed", reason="truncated") for d in (NONE, ldp(8.0))]
     (board,) = made(tmp_path, reconstructions(NONE, [0.5]), reconstructions(ldp(8.0), [0.4]), broken)
-    assert [one.rank for one in standings(board)] == [1, 2]
+    assert [one.rank for one in rank_defenses(board)] == [1, 2]
 
 
 # ---- what a server can do
@@ -184,7 +184,7 @@ def test_recall_is_told_by_day_and_by_night_with_wilsons_interval(tmp_path: Path
     hits = [1, 1, 1, 0, 1, 0, 0]
     (board,) = made(tmp_path, localizations(NONE, hits, ["day"] * 4 + ["night"] * 3))
     assert board.conditions == ("day", "night")
-    assert not board.attacked
+    assert not board.has_attacks
     (row,) = group_tables.pairs(board).rows
     for condition, (successes, trials) in {"day": (3, 4), "night": (1, 3)}.items():
         value = row.values[f"recall_0.25m_2deg_{condition}"]
@@ -210,5 +210,5 @@ def test_a_query_that_was_not_localized_counts_in_the_median(tmp_path: Path) -> 
 
 def test_boards_of_attacks_come_first(tmp_path: Path) -> None:
     found = made(tmp_path, localizations(NONE, [1], [None]), reconstructions(NONE, [0.5]))
-    assert [board.attacked for board in found] == [True, False]
-    assert found[1].head["dataset"]["name"] == GALLERY["name"]
+    assert [board.has_attacks for board in found] == [True, False]
+    assert found[1].metadata["dataset"]["name"] == GALLERY["name"]

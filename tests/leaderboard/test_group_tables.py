@@ -10,7 +10,7 @@ import pytest
 from fabricated import DIA, inapplicable, ldp, localizations, reconstructions
 
 from leaderboard import comparison, group_tables
-from leaderboard.comparison import Board
+from leaderboard.comparison import ComparisonGroup
 from leaderboard.group_tables import Sheet
 from leaderboard.intervals import interval
 
@@ -20,14 +20,14 @@ HOSTILE = "<script>alert(1)</script> | *b* [x](javascript:y) $\\input{z}$ & 50% 
 
 
 @pytest.fixture
-def board(tmp_path: Path) -> Board:
+def board(tmp_path: Path) -> ComparisonGroup:
     records = [
         *reconstructions(NONE, [0.7, 0.9]),
         *reconstructions(ldp(8.0), [0.3, 0.4]),
         *reconstructions(ldp(8.0), [0.1, 0.2], attack=NEAREST),
         inapplicable(NONE, NEAREST, "nearest attacks Subspaces; none releases Descriptors"),
     ]
-    (found,) = comparison.boards(comparison.find(fabricated.write(tmp_path, records)))
+    (found,) = comparison.build_groups(comparison.load_records(fabricated.write(tmp_path, records)))
     return found
 
 
@@ -35,7 +35,7 @@ def cells(line: str, bar: str) -> list[str]:
     return [cell.strip() for cell in re.split(bar, line)]
 
 
-def test_numbers_stand_with_their_bootstrap_intervals(board: Board) -> None:
+def test_numbers_stand_with_their_bootstrap_intervals(board: ComparisonGroup) -> None:
     row = group_tables.ranking(board).rows[0]
     assert row.values["ssim"] == interval([0.3, 0.4])
     assert row.values["epsilon_descriptor"] == 8.0
@@ -44,7 +44,7 @@ def test_numbers_stand_with_their_bootstrap_intervals(board: Board) -> None:
     assert "| **0.35 [0.3, 0.4]** |" in group_tables.to_markdown(group_tables.ranking(board))
 
 
-def test_the_best_is_bold_among_the_strongest_attacks_alone(board: Board) -> None:
+def test_the_best_is_bold_among_the_strongest_attacks_alone(board: ComparisonGroup) -> None:
     """A weak attack on a defense makes no column's best: it says little of the defense."""
     every = group_tables.pairs(board)
     (ssim,) = (column for column in every.columns if column.name == "ssim")
@@ -53,7 +53,7 @@ def test_the_best_is_bold_among_the_strongest_attacks_alone(board: Board) -> Non
     assert r"\textbf{0.35 {[}0.3, 0.4{]}}" in group_tables.to_latex(every)
 
 
-def test_what_does_not_apply_is_told_why(board: Board) -> None:
+def test_what_does_not_apply_is_told_why(board: ComparisonGroup) -> None:
     every = group_tables.pairs(board)
     (row,) = (row for row in every.rows if row.cell.reason)
     assert row.values["ssim"] is None
@@ -65,7 +65,7 @@ def test_what_does_not_apply_is_told_why(board: Board) -> None:
     assert f"[{mark[1]}] nearest attacks Subspaces; none releases Descriptors" in written
 
 
-def test_csv_has_full_precision_and_the_ends_of_intervals(board: Board) -> None:
+def test_csv_has_full_precision_and_the_ends_of_intervals(board: ComparisonGroup) -> None:
     first, *_ = csv.DictReader(io.StringIO(group_tables.to_csv(group_tables.ranking(board))))
     expected = interval([0.3, 0.4])
     assert [float(first[name]) for name in ("ssim", "ssim_low", "ssim_high")] == [expected.mean, expected.low, expected.high]
@@ -78,7 +78,7 @@ def test_csv_has_full_precision_and_the_ends_of_intervals(board: Board) -> None:
 
 
 def test_a_single_photograph_has_no_interval(tmp_path: Path) -> None:
-    (found,) = comparison.boards(comparison.find(fabricated.write(tmp_path, reconstructions(NONE, [0.5]))))
+    (found,) = comparison.build_groups(comparison.load_records(fabricated.write(tmp_path, reconstructions(NONE, [0.5]))))
     assert "| 0.5 |" in group_tables.to_markdown(group_tables.ranking(found))
     (row,) = csv.DictReader(io.StringIO(group_tables.to_csv(group_tables.ranking(found))))
     assert (row["ssim"], row["ssim_low"]) == ("0.5", "n/a")
@@ -89,13 +89,13 @@ def test_what_only_some_photographs_have_tells_how_many(tmp_path: Path) -> None:
     records = reconstructions(NONE, [0.5, 0.6, 0.7])
     for record, face in zip(records, (None, 1.0, 0.0), strict=True):
         record["metrics"]["face"] = face
-    (found,) = comparison.boards(comparison.find(fabricated.write(tmp_path, records)))
+    (found,) = comparison.build_groups(comparison.load_records(fabricated.write(tmp_path, records)))
     (row,) = group_tables.pairs(found).rows
     (column,) = (column for column in group_tables.pairs(found).columns if column.name == "face")
     assert group_tables.shown(column, row) == "0.5 [0, 1] (n = 2)"
 
 
-def test_latex_is_booktabs_of_even_rows(board: Board) -> None:
+def test_latex_is_booktabs_of_even_rows(board: ComparisonGroup) -> None:
     written = group_tables.to_latex(group_tables.pairs(board))
     assert all(rule in written for rule in (r"\toprule", r"\midrule", r"\bottomrule"))
     layout = re.search(r"\\begin\{tabular\}\{(\w+)\}", written)
@@ -110,7 +110,7 @@ def test_strings_of_users_are_text_in_every_format(tmp_path: Path) -> None:
     hostile = {"name": HOSTILE, "field": HOSTILE}
     dataset = fabricated.PHOTOGRAPHS | {"name": HOSTILE}
     records = reconstructions(hostile, [0.5, 0.6], dataset=dataset, attack=DIA | {"name": HOSTILE})
-    (found,) = comparison.boards(comparison.find(fabricated.write(tmp_path, records)))
+    (found,) = comparison.build_groups(comparison.load_records(fabricated.write(tmp_path, records)))
     sheet = group_tables.pairs(found)
     check_rows(sheet)
     (row,) = csv.DictReader(io.StringIO(group_tables.to_csv(sheet)))
@@ -143,7 +143,7 @@ def test_a_broken_escape_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 def test_tables_of_a_server_are_led_by_what_it_is_judged_by(tmp_path: Path) -> None:
     records = [*localizations(NONE, [1, 1], ["day"] * 2), *localizations(ldp(8.0), [1, 0], ["day"] * 2)]
-    (found,) = comparison.boards(comparison.find(fabricated.write(tmp_path, records)))
+    (found,) = comparison.build_groups(comparison.load_records(fabricated.write(tmp_path, records)))
     sheet = group_tables.pairs(found)
     names = [column.name for column in sheet.columns]
     assert "rank" not in names

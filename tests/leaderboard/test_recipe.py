@@ -7,30 +7,30 @@ from typing import Any
 import fabricated
 import pytest
 from fabricated import PHOTOGRAPHS, ldp, reconstructions
-from fakes import album
+from fakes import write_album
 
 from bench import cli
 from bench.api import Attack, Defense, Extractor
 from bench.cli.commands import run
-from bench.codebook.examples import small_dictionary
+from bench.codebook.examples import write_dictionary
 from bench.core.hashing import short_hash
 from bench.datasets.gallery import Gallery
 from bench.extractors.sift import Sift
 from bench.registry import discovery, spec
-from bench.runner import plan as runner
-from bench.runner.plan import Plan, RunConfiguration
+from bench.runner import execute
+from bench.runner.plan import Plan, RunConfiguration, build_plan
 from bench.tasks.collisions import Collisions
 from bench.tasks.localization import Localization
 from bench.tasks.reconstruction import Reconstruction
-from leaderboard.comparison import Cell, Found
-from leaderboard.recipe import recipe
+from leaderboard.comparison import GroupedExperiment, LocatedRecord
+from leaderboard.recipe import build_recipe
 
 
 def planned(command: str) -> Plan:
     """The plan of a command, as `bench run` makes it."""
     program, *words = shlex.split(command)
     assert program == "bench"
-    args, extra = cli.parser().parse_known_args(words)
+    args, extra = cli.build_parser().parse_known_args(words)
     assert not extra
     task = spec.read(args.task, discovery.TASK)
     attacks: list[Attack] = [spec.read(text, discovery.ATTACK) for text in args.attack or []]
@@ -38,14 +38,14 @@ def planned(command: str) -> Plan:
     pairs = tuple((defense, attack) for defense in defenses for attack in attacks or [None])
     extractor: Extractor = spec.read(args.extractor, discovery.EXTRACTOR)
     dataset = None if args.dataset is None else spec.read(args.dataset, discovery.DATASET)
-    return runner.planned(
+    return build_plan(
         RunConfiguration(pairs=pairs, images=args.images, task=task, extractor=extractor, dataset=dataset, seed=args.seed)
     )
 
 
-def written(plan: Plan) -> list[Cell]:
-    heads = [cell.head | {"unit": "a", "status": "ok", "reason": None} for cell in plan.cells]
-    return [Cell(defense="d", attack="a", found=(Found(head, Path()),)) for head in heads]
+def written(plan: Plan) -> list[GroupedExperiment]:
+    heads = [cell.metadata | {"sample": "a", "status": "ok", "reason": None} for cell in plan.experiments]
+    return [GroupedExperiment(defense="d", attack="a", records=(LocatedRecord(head, Path()),)) for head in heads]
 
 
 UPRIGHT, ORIENTED = Sift(), Sift(upright=False, max_keypoints=77)
@@ -66,16 +66,16 @@ UPRIGHT, ORIENTED = Sift(), Sift(upright=False, max_keypoints=77)
 def test_the_command_is_the_cell(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, defense: str, attack: str, extractor: Extractor
 ) -> None:
-    album(tmp_path / "my album")
+    write_album(tmp_path / "my album")
     monkeypatch.chdir(tmp_path)
     pairs = ((spec.read(defense, discovery.DEFENSE), spec.read(attack, discovery.ATTACK)),)
     asked = RunConfiguration(
         pairs=pairs, images=Path("my album"), task=Reconstruction(), extractor=extractor, dataset=None, seed=7
     )
-    plan = runner.planned(asked)
+    plan = build_plan(asked)
     (cell,) = written(plan)
-    command = recipe(cell).command
-    assert planned(command).hash == plan.hash == short_hash([cell.head["cell_id"]])
+    command = build_recipe(cell).command
+    assert planned(command).hash == plan.hash == short_hash([cell.metadata["experiment_id"]])
 
 
 def test_what_is_as_by_default_is_not_spelt_out(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -87,18 +87,18 @@ def test_what_is_as_by_default_is_not_spelt_out(monkeypatch: pytest.MonkeyPatch)
         dataset=None,
         seed=0,
     )
-    (cell,) = written(runner.planned(asked))
-    assert recipe(cell).command == "bench run --task collisions --defense affine --seed 0"
-    assert recipe(cell).needs == ()
+    (cell,) = written(build_plan(asked))
+    assert build_recipe(cell).command == "bench run --task collisions --defense affine --seed 0"
+    assert build_recipe(cell).needs == ()
 
 
 def test_words_of_a_place_are_made_there_again() -> None:
     tiny = Gallery(width=64, height=48, detail=0.1, views=2, queries=2)
     ldp = spec.read("ldp:epsilon=9,words=32,dictionary=references", discovery.DEFENSE)
     task = Localization(retrieval="released", trials=100)
-    plan = runner.planned(RunConfiguration(pairs=((ldp, None),), images=None, task=task, extractor=Sift(), dataset=tiny, seed=1))
+    plan = build_plan(RunConfiguration(pairs=((ldp, None),), images=None, task=task, extractor=Sift(), dataset=tiny, seed=1))
     (cell,) = written(plan)
-    found = recipe(cell)
+    found = build_recipe(cell)
     assert found.command == (
         "bench run --task localization:retrieval=released,trials=100 --defense ldp:epsilon=9,words=32 "
         "--dataset gallery:views=2,queries=2,width=64,height=48,detail=0.1 --seed 1"
@@ -108,42 +108,42 @@ def test_words_of_a_place_are_made_there_again() -> None:
 
 
 def test_files_of_ones_own_are_named_by_their_digest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    own = small_dictionary(tmp_path)
-    album(tmp_path / "album")
+    own = write_dictionary(tmp_path)
+    write_album(tmp_path / "album")
     monkeypatch.chdir(tmp_path)
     pairs = ((spec.read(f"ldp:epsilon=5,dictionary={own}", discovery.DEFENSE), spec.read("keypoints", discovery.ATTACK)),)
-    plan = runner.planned(
+    plan = build_plan(
         RunConfiguration(pairs=pairs, images=Path("album"), task=Reconstruction(), extractor=Sift(), dataset=None, seed=0)
     )
     (cell,) = written(plan)
-    found = recipe(cell)
+    found = build_recipe(cell)
     assert found.command == "bench run --defense ldp:epsilon=5,dictionary=FILE --attack keypoints --images album --seed 0"
-    digest = cell.head["defense"]["dictionary"]
+    digest = cell.metadata["defense"]["dictionary"]
     assert f"FILE for dictionary of ldp: {digest}" in found.needs
     assert planned(found.command.replace("FILE", own)).hash == plan.hash
 
 
-def of(records: list[dict[str, Any]]) -> Cell:
-    return Cell(defense="d", attack="a", found=tuple(Found(one, Path()) for one in records))
+def of(records: list[dict[str, Any]]) -> GroupedExperiment:
+    return GroupedExperiment(defense="d", attack="a", records=tuple(LocatedRecord(one, Path()) for one in records))
 
 
 def test_a_plugin_that_is_not_here_has_all_its_fields() -> None:
     stranger = {"name": "stranger", "levels": 8, "soft": True, "rate": 0.5, "file": None}
-    (command,) = recipe(of(reconstructions(stranger, [0.5], attack={"name": "unheard-of"}))).command.splitlines()
+    (command,) = build_recipe(of(reconstructions(stranger, [0.5], attack={"name": "unheard-of"}))).command.splitlines()
     assert "--defense stranger:levels=8,soft=true,rate=0.5,file=none --attack unheard-of" in command
 
 
 def test_each_seed_has_its_line() -> None:
     records = reconstructions(ldp(8.0), [0.5], seed=3) + reconstructions(ldp(8.0), [0.5], seed=1)
-    assert [line.rpartition(" ")[2] for line in recipe(of(records)).command.splitlines()] == ["1", "3"]
+    assert [line.rpartition(" ")[2] for line in build_recipe(of(records)).command.splitlines()] == ["1", "3"]
 
 
 @pytest.mark.parametrize("name", ["$(touch pwned)", "a b; rm -rf x", "--out=elsewhere", "it's\n`id`"])
 def test_a_shell_takes_names_for_names(name: str) -> None:
     cell = of(reconstructions({"name": name}, [0.5], dataset=PHOTOGRAPHS | {"name": name}))
-    program, run, *words = shlex.split(recipe(cell).command)
+    program, run, *words = shlex.split(build_recipe(cell).command)
     assert (program, run) == ("bench", "run")
-    args, extra = cli.parser().parse_known_args([run, *words])
+    args, extra = cli.build_parser().parse_known_args([run, *words])
     assert not extra
     assert args.defense == [name]
     assert args.images == Path(name)
@@ -156,12 +156,12 @@ def test_the_settings_of_a_task_are_told() -> None:
         "task_settings": {"retrieval": "released", "retrieved": 20, "trials": 500},
         "attack": None,
     }
-    command = recipe(of(reconstructions({"name": "none"}, [0.5], **settings))).command
+    command = build_recipe(of(reconstructions({"name": "none"}, [0.5], **settings))).command
     assert command.startswith("bench run --task localization:retrieval=released,trials=500 --defense none --images photos")
 
 
 def test_the_place_of_a_dataset_is_told_by_its_spec() -> None:
     gallery = fabricated.GALLERY | {"spec": {"name": "gallery", "views": 12, "queries": 300}}
     cell = of(reconstructions({"name": "none"}, [0.5], dataset=gallery))
-    assert "--dataset gallery:views=12" in recipe(cell).command
-    assert "--images" not in recipe(cell).command
+    assert "--dataset gallery:views=12" in build_recipe(cell).command
+    assert "--images" not in build_recipe(cell).command

@@ -9,19 +9,19 @@ from typing import Any
 import numpy as np
 import pytest
 from fake_plugins.guess import Guess
-from fakes import FAKES, album, install
+from fakes import FAKES, write_album, install_plugins
 from scipy import stats
 
 import bench
 from bench import cli
 from bench.api import View
-from bench.codebook.examples import small_dictionary
+from bench.codebook.examples import write_dictionary
 from bench.geometry.nearest_words import unit_rows
 from bench.tasks.reconstruction import Reconstruction
 from bench.types import Features, WordSets
 from defenses.ldp import LDP
 from leaderboard import regression_report, speed
-from leaderboard.regression import Finding, compare, tolerance
+from leaderboard.regression import RegressionResult, compare, compute_tolerance
 
 Records = list[dict[str, Any]]
 SEEDS = range(2)
@@ -32,9 +32,9 @@ PAINTED = Reconstruction(inverter="painter")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """With photographs in it, and the fake plugins installed for as long as it is used."""
     made = tmp_path_factory.mktemp("regression")
-    album(made / "album", 3)
+    write_album(made / "album", 3)
     with pytest.MonkeyPatch.context() as monkeypatch:
-        install(made / "installed", monkeypatch, FAKES)
+        install_plugins(made / "installed", monkeypatch, FAKES)
         yield made
 
 
@@ -45,11 +45,11 @@ def before(folder: Path) -> Records:
 
 def measured(folder: Path, seeds: range, epsilon: float = 8.0) -> Records:
     """The first word of each set as a guess, at an ε where about every second set holds the true one."""
-    defense = LDP(epsilon=epsilon, dictionary=small_dictionary(folder))
+    defense = LDP(epsilon=epsilon, dictionary=write_dictionary(folder))
     return [record for seed in seeds for record in bench.run([defense], [Guess()], folder / "album", task=PAINTED, seed=seed)]
 
 
-def verdicts(found: list[Finding]) -> dict[str, str]:
+def verdicts(found: list[RegressionResult]) -> dict[str, str]:
     return {finding.metric: finding.verdict for finding in found}
 
 
@@ -124,10 +124,10 @@ def test_a_weaker_promise_is_worse_without_tolerance(folder: Path, before: Recor
 
 def test_lost_units_failures_and_cells(folder: Path, before: Records) -> None:
     broken = [
-        record | {"status": "failed", "reason": "out of paper"} if record["unit"] == "1.png" else record for record in before
+        record | {"status": "failed", "reason": "out of paper"} if record["sample"] == "1.png" else record for record in before
     ]
     (lost,) = [finding for finding in compare(before, broken) if finding.verdict == "missing"]
-    assert lost.told == "1 of 3 units: 1.png: out of paper"
+    assert lost.note == "1 of 3 units: 1.png: out of paper"
     other = measured(folder, range(1), epsilon=9.0)
     assert [finding.verdict for finding in compare(before, other)] == ["missing", "new"]
 
@@ -145,9 +145,9 @@ def test_utility_has_its_own_direction() -> None:
     """Recall of localization, which no attack takes part in."""
 
     def judged(recall: float) -> Records:
-        head = {"cell_id": "0", "schema": 1, "task": "localization", "defense": {"name": "none"}, "attack": None, "dataset": {}}
+        head = {"experiment_id": "0", "schema": 1, "task": "localization", "defense": {"name": "none"}, "attack": None, "dataset": {}}
         head |= {"status": "ok", "privacy": {"guarantee": "none", "epsilon_descriptor": None}}
-        return [head | {"unit": str(unit), "metrics": {"recall_0.25m_2deg": recall}} for unit in range(5)]
+        return [head | {"sample": str(unit), "metrics": {"recall_0.25m_2deg": recall}} for unit in range(5)]
 
     assert verdicts(compare(judged(0.9), judged(0.5))) == {"recall_0.25m_2deg": "worse"}
     assert verdicts(compare(judged(0.5), judged(0.9))) == {"recall_0.25m_2deg": "better"}
@@ -164,7 +164,7 @@ def drawn(rng: np.random.Generator, units: int, seeds: int, spread: float) -> di
 def test_tolerance_of_one_unit_is_that_of_students_test(rng: np.random.Generator) -> None:
     before, after = drawn(rng, 1, 5, 2.0), drawn(rng, 1, 4, 2.0)
     reference = stats.ttest_ind(after["0"], before["0"]).confidence_interval(0.999)
-    assert tolerance(before, after, 0.0) == pytest.approx((reference.high - reference.low) / 2)
+    assert compute_tolerance(before, after, 0.0) == pytest.approx((reference.high - reference.low) / 2)
 
 
 def test_false_alarms_are_rare_and_shifts_are_found(rng: np.random.Generator) -> None:
@@ -173,7 +173,7 @@ def test_false_alarms_are_rare_and_shifts_are_found(rng: np.random.Generator) ->
     def apart(shift: float) -> bool:
         before, after = drawn(rng, 7, 3, 1.0), drawn(rng, 7, 3, 1.0)
         gap = np.mean([np.mean(after[unit]) + shift - np.mean(before[unit]) for unit in before])
-        return bool(abs(gap) > tolerance(before, after, 0.0))
+        return bool(abs(gap) > compute_tolerance(before, after, 0.0))
 
     assert sum(apart(0.0) for _ in range(2000)) <= 10  # two are expected
     assert sum(apart(3.0) for _ in range(200)) >= 198
@@ -183,9 +183,9 @@ def test_one_seed_takes_the_spread_over_units_and_one_unit_the_floor() -> None:
     before = {str(unit): [0.0] for unit in range(7)}
     steady = {str(unit): [0.1 + unit / 1000] for unit in range(7)}
     mixed = {str(unit): [0.3 * (-1) ** unit] for unit in range(7)}
-    assert tolerance(before, steady, 0.01) == 0.01  # all units moved alike
-    assert tolerance(before, mixed, 0.01) > 0.2
-    assert tolerance({"0": [0.0]}, {"0": [5.0]}, 0.01) == 0.01
+    assert compute_tolerance(before, steady, 0.01) == 0.01  # all units moved alike
+    assert compute_tolerance(before, mixed, 0.01) > 0.2
+    assert compute_tolerance({"0": [0.0]}, {"0": [5.0]}, 0.01) == 0.01
 
 
 # ---- the command
@@ -220,7 +220,7 @@ def test_annotations_are_escaped(folders: tuple[Path, Path], capfd: pytest.Captu
     assert cli.main(["check", "--baseline", baseline, "--results", results, "--format", "github"]) == 3
     (line, _) = capfd.readouterr().out.splitlines()
     assert line.startswith("::error title=worse%3A ldp%3Aepsilon=8%2Csubset_size=2%2Cwords=0 against guess::recovered was 0.")
-    nasty = Finding(verdict="missing", defense="a::b,100%\r\n::error::", attack="c", told="50%\r\n::stop-commands::x")
+    nasty = RegressionResult(verdict="missing", defense="a::b,100%\r\n::error::", attack="c", note="50%\r\n::stop-commands::x")
     written = regression_report.to_github(nasty)
     assert written == (
         "::warning title=missing%3A a%3A%3Ab%2C100%25%0D%0A%3A%3Aerror%3A%3A against c::50%25%0D%0A::stop-commands::x"
@@ -238,7 +238,7 @@ def timed(path: Path, **minutes: float) -> Path:
 
 
 def test_speed_is_compared_as_ratios(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    good = speed.ratios(timed(tmp_path / "good.json", bare=1.0, search=1.5))
+    good = speed.compute_ratios(timed(tmp_path / "good.json", bare=1.0, search=1.5))
     assert good == {"nearest word: test_speed_of_the_search": 1.5}
     baseline = tmp_path / "speed.json"
     baseline.write_text(json.dumps(good))

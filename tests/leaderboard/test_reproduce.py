@@ -1,4 +1,4 @@
-"""`bench reproduce` from end to end in its smallest form: files, verdicts from records, and going on after an interruption."""
+"""`bench reproduce` from end to end in its smallest form: files, verdicts from records, and resuming after an interruption."""
 
 import csv
 import json
@@ -10,25 +10,26 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from fakes import texture
+from fakes import draw_texture
 from PIL import Image
 
 from bench import cli
-from bench.api import Asset, Attack, Defense
+from bench.api import Attack, Defense
 from bench.cache import store
 from bench.codebook.public import ASSETS, Public
 from bench.core import progress
 from bench.extractors.sift import Sift
 from bench.registry import discovery
 from bench.runner.records import FILE, Record
+from bench.settings import Asset
 from bench.tasks.reconstruction import Reconstruction
 from leaderboard.reproduce import command, figures, page, run, tables
 from leaderboard.reproduce.claims import Claim, Verdict, falling, same_order
 from leaderboard.reproduce.profiles import CPU, SMOKE, Materials, Setting
-from leaderboard.reproduce.run import Judged, Ran
-from leaderboard.reproduce.study import Measure, Row, Table, build
+from leaderboard.reproduce.run import RunResult, TestSet
+from leaderboard.reproduce.study import Measure, Row, Table, build_plugin
 
-TABLES = sorted(tables.everything())
+TABLES = sorted(tables.load_tables())
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +37,7 @@ def images(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two pictures of some 30 keypoints."""
     folder = tmp_path_factory.mktemp("reproduce")
     for number in range(2):
-        texture(number, (56, 48)).save(folder / f"{number}.png")
+        draw_texture(number, (56, 48)).save(folder / f"{number}.png")
     return folder
 
 
@@ -46,7 +47,7 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("reproduce") / "out"
 
 
-PLACE = "gallery:views=8,queries=3,width=320,height=240,rooms=1,detail=0.3"
+GALLERY = "gallery:views=8,queries=3,width=320,height=240,rooms=1,detail=0.3"
 WALK = "walk:views=4,others=6,steps=60,width=320,height=240,detail=0.3"
 
 
@@ -58,13 +59,12 @@ def _cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 
 def reproduce(name: str, images: Path, out: Path, *more: str) -> int:
-    of_place = name in command.of_places()
-    place = WALK if name == "tableS2" else PLACE  # which of its queries are of one camera
-    judged = ("--dataset", place, "--workers", "1") if of_place else ("--images", str(images))
-    return cli.main(["reproduce", name, "--profile", "smoke", *judged, "--out", str(out), *more])
+    dataset = WALK if name == "tableS2" else GALLERY  # all of its images are of one camera
+    source = ("--dataset", dataset, "--workers", "1") if command.takes_dataset(name) else ("--images", str(images))
+    return cli.main(["reproduce", name, "--profile", "smoke", *source, "--out", str(out), *more])
 
 
-def lines(out: Path) -> list[bytes]:
+def read_lines(out: Path) -> list[bytes]:
     return (out / FILE).read_bytes().splitlines()
 
 
@@ -74,75 +74,75 @@ def lines(out: Path) -> list[bytes]:
 @pytest.mark.parametrize("name", TABLES)
 def test_smoke(name: str, images: Path, out: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert reproduce(name, images, out) == 0
-    printed = capsys.readouterr().out
-    found = json.loads((out / f"{name}.json").read_text())
-    measured = [row for row in found["rows"] if any(value["ours"] is not None for value in row["ours"].values())]
+    output = capsys.readouterr().out
+    report = json.loads((out / f"{name}.json").read_text())
+    measured = [row for row in report["rows"] if any(value["ours"] is not None for value in row["ours"].values())]
     assert measured
-    assert all(row["note"].startswith("n/a") for row in found["rows"] if row not in measured)
-    written = (out / f"{name}.md").read_text()
-    for claim in found["claims"]:
-        assert claim["claim"] in written
-        assert claim["verdict"] == "cannot tell"  # of two photographs nothing can be told
+    assert all(row["note"].startswith("n/a") for row in report["rows"] if row not in measured)
+    markdown = (out / f"{name}.md").read_text()
+    for claim in report["claims"]:
+        assert claim["claim"] in markdown
+        assert claim["verdict"] == "cannot tell"  # two photographs are too few
         assert claim["statements"]
-    assert found["title"] in printed
-    if tables.everything()[name].draw is not None:
-        drawn = sorted((out / "figures").glob(f"{name}-*"))
-        assert {file.suffix for file in drawn} == {".png", ".pdf"}
-        assert all(str(file) in printed for file in drawn)
-        assert np.asarray(Image.open(drawn[1]).convert("L")).std() > 5  # something is drawn
-    cells = list(csv.DictReader((out / f"{name}.csv").open(encoding="utf-8")))
-    assert len(cells) == len(found["rows"]) * len(tables.everything()[name].measures)
+    assert report["title"] in output
+    if tables.load_tables()[name].draw is not None:
+        files = sorted((out / "figures").glob(f"{name}-*"))
+        assert {file.suffix for file in files} == {".png", ".pdf"}
+        assert all(str(file) in output for file in files)
+        assert np.asarray(Image.open(files[1]).convert("L")).std() > 5  # something is drawn
+    entries = list(csv.DictReader((out / f"{name}.csv").open(encoding="utf-8")))
+    assert len(entries) == len(report["rows"]) * len(tables.load_tables()[name].measures)
     statements = list(csv.DictReader((out / f"{name}-claims.csv").open(encoding="utf-8")))
-    assert len(statements) == sum(len(claim["statements"]) for claim in found["claims"])
+    assert len(statements) == sum(len(claim["statements"]) for claim in report["claims"])
 
 
-def test_done_again_nothing_runs_and_all_stays(images: Path, out: Path) -> None:
-    """And Table 4 takes what it compares with from Table 1's records."""
+def test_repeated_reproduction_runs_nothing_and_changes_nothing(images: Path, out: Path) -> None:
+    """Table 4 reuses Table 1's records for its reference rows."""
     for name in ("table1", "table4"):
         if not (out / f"{name}.json").is_file():  # as it is after `test_smoke`
             assert reproduce(name, images, out) == 0
-    before, text = lines(out), (out / "table4.json").read_bytes()
+    before, text = read_lines(out), (out / "table4.json").read_bytes()
     assert reproduce("table4", images, out) == 0
-    assert lines(out) == before
+    assert read_lines(out) == before
     assert (out / "table4.json").read_bytes() == text
     first, fourth = (
-        {cell for row in json.loads((out / f"{name}.json").read_text())["rows"] for cell in row["cell_ids"]}
+        {key for row in json.loads((out / f"{name}.json").read_text())["rows"] for key in row["cell_ids"]}
         for name in ("table1", "table4")
     )
     assert len(first & fourth) == 12
 
 
-def unanswered(setting: Setting) -> dict[str, str | None]:
-    """Rows of tables about photographs that no attack as configured answers -> why."""
+def find_unsupported_rows(setting: Setting) -> dict[str, str | None]:
+    """Return the rows of photograph tables whose attack as configured does not apply -> why."""
     public = Public()
-    every = [row for table in tables.everything().values() if not table.place for row in table.rows(setting)]
-    reasons = {row.name: row.task.explain_not_applicable(row.defense, row.attack, setting.extractor, public) for row in every}
+    rows = [row for table in tables.load_tables().values() if not table.dataset for row in table.build_rows(setting)]
+    reasons = {row.name: row.task.explain_not_applicable(row.defense, row.attack, setting.extractor, public) for row in rows}
     return {name: reason for name, reason in reasons.items() if reason is not None}
 
 
-def test_what_is_shipped_answers_every_row() -> None:
+def test_shipped_files_support_every_row() -> None:
     setting = Setting(profile=CPU, materials=Materials(), extractor=Sift(), photographs=7)
-    assert unanswered(setting) == {}
+    assert find_unsupported_rows(setting) == {}
     another = Materials(ldp_network=Asset(str(ASSETS / "inversion-none.safetensors")))
-    assert len(unanswered(replace(setting, materials=another))) == 16
+    assert len(find_unsupported_rows(replace(setting, materials=another))) == 16
 
 
 @pytest.mark.parametrize("name", ["figures", "figure-inlier"])
 def test_figures(name: str, images: Path, out: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert reproduce(name, images, out) == 0
-    printed = capsys.readouterr().out
-    drawings = [drawing for drawing in figures.everything() if drawing.place == (name != "figures")]
+    output = capsys.readouterr().out
+    drawings = [drawing for drawing in figures.load_figures() if drawing.uses_queries == (name != "figures")]
     assert drawings
     for drawing in drawings:
         files = sorted((out / "figures").rglob(f"{drawing.name}*"))
         assert {file.suffix for file in files} == {".png", ".pdf"}
         for file in files:
-            assert str(file) in printed
+            assert str(file) in output
             if file.suffix == ".png":
                 assert np.asarray(Image.open(file).convert("L")).std() > 5  # something is drawn
 
 
-def test_interrupted_reproduction_goes_on_and_ends_as_if_it_had_not_been(
+def test_interrupted_reproduction_resumes_with_the_same_result(
     images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole, broken = tmp_path / "whole", tmp_path / "broken"
@@ -156,10 +156,10 @@ def test_interrupted_reproduction_goes_on_and_ends_as_if_it_had_not_been(
 
         interrupted.setattr(progress.Progress, "advance", once)
         assert reproduce("tableS3", images, broken) == 130
-    assert len(lines(broken)) == 1
+    assert len(read_lines(broken)) == 1
     assert not (broken / "tableS3.json").exists()
     assert reproduce("tableS3", images, broken) == 0
-    assert len(lines(broken)) == len(lines(whole)) == 4
+    assert len(read_lines(broken)) == len(read_lines(whole)) == 4
     for name in ("tableS3.json", "tableS3.md", "tableS3.csv", "tableS3-claims.csv"):
         assert (broken / name).read_bytes() == (whole / name).read_bytes()
 
@@ -168,13 +168,13 @@ def test_interrupted_reproduction_goes_on_and_ends_as_if_it_had_not_been(
     ("words", "complaint"),
     [
         (("table7",), "unknown table 'table7'; did you mean"),
-        (("table1", "--profile", "big"), "unknown profile 'big'; there is cpu, paper, smoke"),
+        (("table1", "--profile", "big"), "unknown profile 'big'; available: cpu, paper, smoke"),
         (("table4", "--profile", "paper"), "has 256,000 words, and profile paper needs 512,000"),
         (("tableS3", "--images", "nowhere"), "no such folder"),
         (("tableS3", "--database", "nowhere.safetensors"), "nowhere.safetensors"),
         (("tableS3", "--size", "3"), "unknown option '--size'"),
-        (("table2", "--images", "nowhere"), "table2 is about a place: name it with --dataset"),
-        (("table1", "--dataset", "gallery"), "table1 is about photographs: name them with --images"),
+        (("table2", "--images", "nowhere"), "table2 uses a dataset: pass it with --dataset"),
+        (("table1", "--dataset", "gallery"), "table1 uses photographs: pass them with --images"),
         ((), "--what is missing"),
     ],
 )
@@ -189,9 +189,9 @@ def test_mistakes(words: tuple[str, ...], complaint: str, tmp_path: Path, capsys
 PAPER = {"raw": 0.7, "two": 0.5, "four": 0.4, "none": 0.1}
 
 
-def made_up_rows(setting: Setting) -> tuple[Row, ...]:
-    defense: Defense = build(discovery.DEFENSE, "none", {})
-    attack: Attack = build(discovery.ATTACK, "dia", {})
+def build_rows(setting: Setting) -> tuple[Row, ...]:
+    defense: Defense = build_plugin(discovery.DEFENSE, "none", {})
+    attack: Attack = build_plugin(discovery.ATTACK, "dia", {})
     return tuple(
         Row(name=name, labels={"row": name}, paper={"ssim": ssim}, defense=defense, attack=attack, task=Reconstruction())
         for name, ssim in PAPER.items()
@@ -201,105 +201,106 @@ def made_up_rows(setting: Setting) -> tuple[Row, ...]:
 TABLE = Table(
     name="made-up",
     title="A table",
-    measures={"ssim": Measure(metric="ssim", times=2.0), "other": Measure(metric="other")},
-    rows=made_up_rows,
-    claims=lambda paper: (
+    measures={"ssim": Measure(metric="ssim", factor=2.0), "other": Measure(metric="other")},
+    build_rows=build_rows,
+    build_claims=lambda paper: (
         same_order(paper, 0.03, "SSIM"),
         Claim(text="It falls.", statements=falling([("two", "ssim"), ("four", "ssim")])),
     ),
-    ordered="ssim",
+    rank_measure="ssim",
 )
 
 
-def made_up(ssim: dict[str, list[float | None]]) -> run.Rebuilt:
-    """A table from records that hold half the given values; None for a photograph that failed, and no values for n/a."""
+def reproduce_table(ssim: dict[str, list[float | None]]) -> run.ReproducedTable:
+    """Return a table from records with half the given values; None: a failed photograph, no values: n/a."""
     setting = Setting(profile=CPU, materials=Materials(), extractor=Sift(), photographs=8)
     records: dict[str, tuple[Record, ...]] = {
         name: tuple(
-            {"unit": str(unit), "seed": 0, "status": "failed", "reason": "broken", "metrics": {}, "notes": []}
+            {"sample": str(number), "seed": 0, "status": "failed", "reason": "broken", "metrics": {}, "notes": []}
             if value is None
             else {
-                "unit": str(unit),
+                "sample": str(number),
                 "seed": 0,
                 "status": "ok",
                 "reason": None,
                 "metrics": {"ssim": value / 2},
                 "notes": ["small"],
             }
-            for unit, value in enumerate(values)
+            for number, value in enumerate(values)
         )
-        or ({"unit": "*", "seed": 0, "status": "n/a", "reason": "no network", "metrics": {}, "notes": []},)
+        or ({"sample": "*", "seed": 0, "status": "n/a", "reason": "no network", "metrics": {}, "notes": []},)
         for name, values in ssim.items()
     }
-    ran = Ran(rows=made_up_rows(setting), cells={name: (name,) for name in ssim}, records=records)
-    return run.weigh(TABLE, setting, Judged(name="photographs", names=("0",) * 8, available=8), ran)
+    result = RunResult(rows=build_rows(setting), experiment_ids={name: (name,) for name in ssim}, records=records)
+    return run.compare_with_paper(TABLE, setting, TestSet(name="photographs", names=("0",) * 8, available=8), result)
 
 
-def around(mean: float, count: int = 8) -> list[float | None]:
+def build_values(mean: float, count: int = 8) -> list[float | None]:
     return [mean + 0.01 * (number % 2) for number in range(count)]
 
 
 def test_means_verdicts_and_correlation_from_records() -> None:
-    rebuilt = made_up({"raw": around(0.6), "two": around(0.3), "four": around(0.4), "none": []})
-    ours = rebuilt.ours["raw", "ssim"]
+    table = reproduce_table({"raw": build_values(0.6), "two": build_values(0.3), "four": build_values(0.4), "none": []})
+    ours = table.ours["raw", "ssim"]
     assert (ours.mean, ours.count) == (pytest.approx(0.605), 8)
-    assert ("none", "ssim") not in rebuilt.ours
-    assert ("raw", "other") not in rebuilt.ours
-    assert rebuilt.correlation == pytest.approx(0.5)  # raw, two, four against raw, four, two
-    order, falls = rebuilt.findings
+    assert ("none", "ssim") not in table.ours
+    assert ("raw", "other") not in table.ours
+    assert table.correlation == pytest.approx(0.5)  # raw, two, four against raw, four, two
+    order, falls = table.claim_results
     assert falls.verdict is Verdict.FAILS
     assert order.verdict is Verdict.FAILS
     verdicts = [evidence.verdict for evidence in order.evidence]
     assert (verdicts.count(Verdict.HOLDS), verdicts.count(Verdict.FAILS), verdicts.count(Verdict.OPEN)) == (2, 1, 3)
 
 
-def test_what_fails_or_does_not_apply_is_said_in_every_form() -> None:
-    rebuilt = made_up({"raw": [None, *around(0.6, 7)], "two": around(0.3), "four": around(0.4), "none": []})
-    assert rebuilt.notes == {"raw": "1 failed; small", "two": "small", "four": "small", "none": "n/a: no network"}
-    assert run.failures(rebuilt.ran) == 1
-    written = page.markdown(rebuilt)
-    assert "does not hold: [two] ssim > [four] ssim: paper 0.1, ours -0.1 [-0.1, -0.1]" in written
-    assert "cannot tell: [raw] ssim > [none] ssim: paper 0.6, nothing measured (none: n/a: no network)" in written
-    assert "(Of 6: 2 hold, 1 do not hold, 3 cannot be told.)" in written
-    shown = page.side_by_side(rebuilt)
-    assert list(shown["n"]) == ["7", "8", "8", "0"]
-    assert shown["ssim, ours"].iloc[3] == "n/a"
-    assert "0.605" in shown["ssim, ours"].iloc[1] or "0.305" in shown["ssim, ours"].iloc[1]
-    plain = page.plain(rebuilt)
-    assert json.loads(json.dumps(plain, allow_nan=False)) == plain
-    assert [claim["verdict"] for claim in plain["claims"]] == ["does not hold", "does not hold"]
-    numbers = page.numbers(rebuilt).set_index(["row", "measure"])
-    assert pd.isna(numbers.loc[("none", "ssim"), "ours"])
-    assert numbers.loc[("two", "ssim"), "photographs"] == 8
+def test_failures_and_not_applicable_rows_are_in_every_output() -> None:
+    ssim = {"raw": [None, *build_values(0.6, 7)], "two": build_values(0.3), "four": build_values(0.4), "none": []}
+    table = reproduce_table(ssim)
+    assert table.notes == {"raw": "1 failed; small", "two": "small", "four": "small", "none": "n/a: no network"}
+    assert run.count_failures(table.result) == 1
+    markdown = page.to_markdown(table)
+    assert "does not hold: [two] ssim > [four] ssim: paper 0.1, ours -0.1 [-0.1, -0.1]" in markdown
+    assert "cannot tell: [raw] ssim > [none] ssim: paper 0.6, nothing measured (none: n/a: no network)" in markdown
+    assert "(Of 6: 2 hold, 1 do not hold, 3 cannot be told.)" in markdown
+    values = page.compare_values(table)
+    assert list(values["n"]) == ["7", "8", "8", "0"]
+    assert values["ssim, ours"].iloc[3] == "n/a"
+    assert "0.605" in values["ssim, ours"].iloc[1] or "0.305" in values["ssim, ours"].iloc[1]
+    report = page.to_json(table)
+    assert json.loads(json.dumps(report, allow_nan=False)) == report
+    assert [claim["verdict"] for claim in report["claims"]] == ["does not hold", "does not hold"]
+    frame = page.tabulate_values(table).set_index(["row", "measure"])
+    assert pd.isna(frame.loc[("none", "ssim"), "ours"])
+    assert frame.loc[("two", "ssim"), "photographs"] == 8
 
 
-def test_a_median_takes_a_unit_without_a_value_for_the_worst() -> None:
-    """And a mean leaves it out. A table that is repeated counts each seed as a unit."""
+def test_median_counts_a_sample_without_a_value_as_the_worst() -> None:
+    """A mean omits it. A table with several seeds counts each seed as a sample."""
     measures = {"mean": Measure(metric="off"), "median": Measure(metric="off", median=True)}
-    table = replace(TABLE, measures=measures, claims=lambda paper: (), ordered=None, repeated=True)
+    definition = replace(TABLE, measures=measures, build_claims=lambda paper: (), rank_measure=None, multiple_seeds=True)
     setting = Setting(profile=CPU, materials=Materials(), extractor=Sift(), photographs=1)
     values = {0: 1.0, 1: None, 2: 2.0, 3: None, 4: None}
     records: dict[str, tuple[Record, ...]] = {
-        f"seed {seed}": ({"unit": "a", "seed": seed, "status": "ok", "reason": None, "metrics": {"off": off}, "notes": []},)
+        f"seed {seed}": ({"sample": "a", "seed": seed, "status": "ok", "reason": None, "metrics": {"off": off}, "notes": []},)
         for seed, off in values.items()
     }
-    row = made_up_rows(setting)[0]
-    ran = Ran(rows=(row,), cells={row.name: tuple(records)}, records=records)
-    rebuilt = run.weigh(table, setting, Judged(name="place", names=("a",), available=1), ran)
-    assert rebuilt.ours["raw", "mean"].mean == 1.5
-    assert rebuilt.ours["raw", "mean"].count == 2
-    assert rebuilt.ours["raw", "median"].mean == float("inf")
-    shown = page.side_by_side(rebuilt).iloc[0]
-    assert shown["median"] == "∞"
-    assert shown["n"] == "2/5"
-    assert "seeds 0 to 5" in page.heading(rebuilt)
-    assert json.loads(json.dumps(page.plain(rebuilt), allow_nan=False))["rows"][0]["ours"]["median"]["ours"] == "inf"
+    row = build_rows(setting)[0]
+    result = RunResult(rows=(row,), experiment_ids={row.name: tuple(records)}, records=records)
+    table = run.compare_with_paper(definition, setting, TestSet(name="scene", names=("a",), available=1), result)
+    assert table.ours["raw", "mean"].mean == 1.5
+    assert table.ours["raw", "mean"].count == 2
+    assert table.ours["raw", "median"].mean == float("inf")
+    values = page.compare_values(table).iloc[0]
+    assert values["median"] == "∞"
+    assert values["n"] == "2/5"
+    assert "seeds 0 to 5" in page.format_heading(table)
+    assert json.loads(json.dumps(page.to_json(table), allow_nan=False))["rows"][0]["ours"]["median"]["ours"] == "inf"
 
 
-def test_the_order_of_the_paper_is_confirmed_where_it_is_there() -> None:
-    rebuilt = made_up({name: around(value) for name, value in PAPER.items()})
-    assert [finding.verdict for finding in rebuilt.findings] == [Verdict.HOLDS, Verdict.HOLDS]
-    assert rebuilt.correlation == pytest.approx(1)
+def test_the_order_of_the_paper_is_confirmed() -> None:
+    table = reproduce_table({name: build_values(value) for name, value in PAPER.items()})
+    assert [result.verdict for result in table.claim_results] == [Verdict.HOLDS, Verdict.HOLDS]
+    assert table.correlation == pytest.approx(1)
 
 
 def test_smoke_is_small() -> None:

@@ -7,12 +7,12 @@ from typing import Any
 
 import fabricated
 import pytest
-from fabricated import DIA, ENVIRONMENT, PHOTOGRAPHS, SETTINGS, inapplicable, ldp, localizations, paint, reconstructions
+from fabricated import DIA, ENVIRONMENT, PHOTOGRAPHS, SETTINGS, draw_picture, inapplicable, ldp, localizations, reconstructions
 
 from bench.runner.directory import reconstruction_path
 from bench.runner.records import experiment_id
 from leaderboard import site
-from leaderboard.run_report import photograph
+from leaderboard.run_report import photograph_path
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 
@@ -56,16 +56,16 @@ def results(folder: Path) -> Path:
         *localizations({"name": "new"}, [0] * 8, DAYS),
     ]
     for number, record in enumerate(reconstructed):
-        paint(reconstruction_path(folder, record), number)
-        if record["unit"] != "2.png":  # of which the photograph has gone
-            paint(photograph(folder, record), 1000 + int(record["unit"][0]))
+        draw_picture(reconstruction_path(folder, record), number)
+        if record["sample"] != "2.png":  # of which the photograph has gone
+            draw_picture(photograph_path(folder, record), 1000 + int(record["sample"][0]))
     return fabricated.write(folder, [*reconstructed, *others])
 
 
 @pytest.fixture(scope="module")
 def index(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("leaderboard")
-    return site.write(results(folder / "runs"), folder / "site").page
+    return site.write([results(folder / "runs")], folder / "site").page
 
 
 @pytest.fixture(scope="module")
@@ -335,22 +335,22 @@ def test_even_a_script_that_got_in_would_not_run(browser: Any, index: Path, tmp_
 
 def test_names_of_records_lead_to_no_other_files(tmp_path: Path) -> None:
     """Somebody's records are shown with the pictures that lie beside them, and with no others."""
-    secret = paint(tmp_path / "secret.png", 1)
+    secret = draw_picture(tmp_path / "secret.png", 1)
     (record,) = reconstructions(NONE, [0.5])
-    record["unit"] = "../../../secret"
+    record["sample"] = "../../../secret"
     folder = fabricated.write(tmp_path / "runs", [record])
-    (folder / "reconstructions" / record["cell_id"]).mkdir(parents=True)
+    (folder / "reconstructions" / record["experiment_id"]).mkdir(parents=True)
     assert reconstruction_path(folder, record).resolve() == secret
-    written = site.write(folder, tmp_path / "site").page
+    written = site.write([folder], tmp_path / "site").page
     assert not (written.parent / "pictures").exists()
-    assert record["cell_id"] == experiment_id({"name": "reconstruction"}, NONE, DIA, PHOTOGRAPHS, 0, SETTINGS)
+    assert record["experiment_id"] == experiment_id({"name": "reconstruction"}, NONE, DIA, PHOTOGRAPHS, 0, SETTINGS)
 
 
 def test_it_is_written_alike_again(tmp_path: Path) -> None:
     records = reconstructions(NONE, [0.8, 0.7]) + reconstructions(ldp(4.0), [0.2, 0.3])
     folder = fabricated.write(tmp_path / "runs", records)
-    site.write(folder, tmp_path / "site")
+    site.write([folder], tmp_path / "site")
     before = {path: path.read_bytes() for path in (tmp_path / "site").rglob("*") if path.is_file()}
     assert {path.suffix for path in before} == {".html", ".md", ".csv", ".tex", ".png", ".pdf"}
-    site.write(folder, tmp_path / "site")
+    site.write([folder], tmp_path / "site")
     assert {path: path.read_bytes() for path in (tmp_path / "site").rglob("*") if path.is_file()} == before

@@ -11,20 +11,21 @@ import numpy as np
 import pytest
 from fake_plugins.guess import Guess
 from fake_plugins.peeker import Peeker
-from fakes import album, install, scene
+from fakes import write_album, install_plugins, write_scene
 
 import bench
 from bench import cli
 from bench.api import View
-from bench.codebook.examples import small_dictionary
+from bench.codebook.examples import write_dictionary
 from bench.codebook.public import Public
 from bench.extractors.sift import Sift
-from bench.localization.scene_index import Place
+from bench.localization.scene_index import SceneIndex
 from bench.localization.server import Server
 from bench.runner import records
 from bench.runner.attack_process import execute_in_attack_process
 from bench.tasks.reconstruction import Reconstruction
-from bench.types import Knowledge, Subspaces
+from bench.threat_model import DefenseDatabase, Knowledge, OtherReleases, PublicDatabase, ServerMap
+from bench.types import Points, Subspaces
 from defenses.affine import Affine
 from defenses.ldp import LDP
 from defenses.none import Undefended
@@ -39,9 +40,9 @@ PLUGINS = {"feature_privacy.attacks": {name: f"fake_plugins.{name}:PLUGIN" for n
 def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Photographs, a dictionary, and the fake plugins installed."""
     made = tmp_path_factory.mktemp("submission")
-    album(made / "album", 2)
+    write_album(made / "album", 2)
     with pytest.MonkeyPatch.context() as monkeypatch:
-        install(made / "installed", monkeypatch, PLUGINS)
+        install_plugins(made / "installed", monkeypatch, PLUGINS)
         yield made
 
 
@@ -52,7 +53,7 @@ def honest(place: Path) -> Lines:
 
 
 def run(place: Path, attack: Any, *more: Any) -> Lines:
-    ldp = LDP(epsilon=8.0, dictionary=small_dictionary(place))
+    ldp = LDP(epsilon=8.0, dictionary=write_dictionary(place))
     return bench.run([ldp, *more], [attack], place / "album", task=Reconstruction(inverter="painter"))
 
 
@@ -60,7 +61,7 @@ def run(place: Path, attack: Any, *more: Any) -> Lines:
 def faults(place: Path, tmp_path: Path) -> Callable[..., list[Fault]]:
     def check(lines: Lines | str, sample: int = 0) -> list[Fault]:
         path = tmp_path / "records.jsonl"
-        path.write_text(lines if isinstance(lines, str) else "".join(json.dumps(line) + "\n" for line in lines))
+        path.write_text(lines if isinstance(lines, str) else "".join(json.dumps(records.seal(line)) + "\n" for line in lines))
         (dictionary,) = place.glob("dictionary-*.safetensors")
         return submission.check(path, images=place / "album", files=[dictionary], sample=sample)[1]
 
@@ -79,7 +80,7 @@ def test_what_looks_at_the_secret_is_found(faults: Callable[..., list[Fault]], p
     assert faults(cheating) == []
     found = faults(cheating, sample=2)
     assert {fault.line for fault in found} == {1, 2}
-    assert any(fault.what.startswith("metrics.recovered: is 1, and 0.") for fault in found)
+    assert any(fault.message.startswith("metrics.recovered: is 1, and 0.") for fault in found)
 
 
 def test_another_number_is_found(faults: Callable[..., list[Fault]], honest: Lines) -> None:
@@ -102,8 +103,8 @@ def hashed_again(record: dict[str, Any]) -> None:
     """As someone who lies with care would."""
     task = {"name": record["task"], **record["task_settings"]}
     parts = (task, record["defense"], record["attack"], record["dataset"], record["seed"], record["metric_settings"])
-    record["cell_id"] = records.experiment_id(*parts)
-    record["run_hash"] = records.run_hash(record["cell_id"], record["environment"])
+    record["experiment_id"] = records.experiment_id(*parts)
+    record["run_hash"] = records.run_hash(record["experiment_id"], record["environment"])
 
 
 @pytest.mark.parametrize(
@@ -113,7 +114,7 @@ def hashed_again(record: dict[str, Any]) -> None:
         (change("more", to=1), "the record: Additional properties are not allowed"),
         (change("seconds", to="1"), "seconds: '1' is not of type 'number'"),
         (change("metrics", "ssim", to=True), "metrics.ssim: True is not of type"),
-        (change("unit", to=7), "unit: 7 is not of type 'string'"),
+        (change("sample", to=7), "sample: 7 is not of type 'string'"),
         (change("privacy", "private", to=True), "privacy.private: False was expected"),
         (change("status", to="good"), "status: 'good' is not one of"),
         (change("reason", to="why"), "reason: 'why' is not of type 'null'"),
@@ -123,13 +124,13 @@ def hashed_again(record: dict[str, Any]) -> None:
         (change("metrics", "keypoints", to=3), "privacy.keypoints: not the keypoints"),
         (change("privacy", "epsilon_image", to=1.0), "privacy.epsilon_image: is 1.0, should be "),
         (change("privacy", "guarantee", to="perfect"), "privacy.guarantee: is perfect, should be epsilon-ldp"),
-        (change("unit", to="7.png"), "unit: the dataset has no '7.png'"),
+        (change("sample", to="7.png"), "sample: the dataset has no '7.png'"),
     ],
 )
 def test_lies_about_one_record(faults: Callable[..., list[Fault]], honest: Lines, lie: Any, complaint: str) -> None:
     lied = copy.deepcopy(honest)
     lie(lied[1])
-    told = [fault.what for fault in faults(lied) if fault.line == 2]
+    told = [fault.message for fault in faults(lied) if fault.line == 2]
     assert any(what.startswith(complaint) for what in told), told
 
 
@@ -152,14 +153,14 @@ def test_lies_about_a_cell_that_are_hashed_again(
         hashed_again(record)
     (fault,) = faults(lied)
     assert fault.line == 1
-    assert complaint in fault.what
+    assert complaint in fault.message
 
 
 def test_pairs_that_do_not_apply_and_pairs_that_do(faults: Callable[..., list[Fault]], honest: Lines) -> None:
     silent = [record | {"status": "n/a", "reason": "no", "metrics": {}, "seconds": None} for record in honest[:2]]
-    assert any("applies, but the record says n/a" in fault.what for fault in faults(silent))
-    bold = honest[0] | {name: honest[2][name] for name in ("defense", "attack", "cell_id", "run_hash")}
-    assert any("does not apply (guess attacks" in fault.what for fault in faults([bold]))
+    assert any("applies, but the record says n/a" in fault.message for fault in faults(silent))
+    bold = honest[0] | {name: honest[2][name] for name in ("defense", "attack", "experiment_id", "run_hash")}
+    assert any("does not apply (guess attacks" in fault.message for fault in faults([bold]))
 
 
 def test_left_out_and_repeated(faults: Callable[..., list[Fault]], honest: Lines) -> None:
@@ -179,7 +180,7 @@ def test_left_out_and_repeated(faults: Callable[..., list[Fault]], honest: Lines
     ],
 )
 def test_lines_that_are_no_records(faults: Callable[..., list[Fault]], text: str, complaint: str) -> None:
-    assert complaint in faults(text)[0].what
+    assert complaint in faults(text)[0].message
 
 
 def test_numbers_too_large_for_a_double(faults: Callable[..., list[Fault]], honest: Lines) -> None:
@@ -189,7 +190,7 @@ def test_numbers_too_large_for_a_double(faults: Callable[..., list[Fault]], hone
 
 def test_command(honest: Lines, place: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "records.jsonl"
-    path.write_text(json.dumps(honest[0] | {"unit": "\x1b[31m\n::error::"}) + "\n")
+    path.write_text(json.dumps(honest[0] | {"sample": "\x1b[31m\n::error::"}) + "\n")
     (dictionary,) = map(str, place.glob("dictionary-*.safetensors"))
     beside = ["--images", str(place / "album"), "--file", dictionary, "--sample", "0"]
     assert cli.main(["submit-check", str(path), *beside]) == 1
@@ -197,7 +198,7 @@ def test_command(honest: Lines, place: Path, tmp_path: Path, capfd: pytest.Captu
     assert all(line.startswith("line 1: ") for line in shown.splitlines())
     assert "\x1b" not in shown
     assert "faults in 1 records" in told
-    path.write_text("".join(json.dumps(record) + "\n" for record in honest))
+    path.write_text("".join(json.dumps(records.seal(record)) + "\n" for record in honest))
     assert cli.main(["submit-check", str(path), *beside]) == 0
     assert cli.main(["submit-check", str(tmp_path / "absent")]) == 2
     assert cli.main(["submit-check", str(path), "--file", str(path)]) == 2
@@ -206,11 +207,11 @@ def test_command(honest: Lines, place: Path, tmp_path: Path, capfd: pytest.Captu
 # ---- the other process
 
 
-def seen(needs: frozenset[Knowledge]) -> View:
+def seen(needs: frozenset[type[Knowledge]]) -> View:
     """A release with others beside it, and a database."""
     known = {
-        Knowledge.OTHER_RELEASES: lambda: lambda count: iter([released(seed) for seed in range(count)]),
-        Knowledge.PUBLIC_DATABASE: lambda: "a database",
+        OtherReleases: lambda: OtherReleases(draw=lambda count: iter([released(seed) for seed in range(count)])),
+        PublicDatabase: lambda: PublicDatabase(words=np.zeros((3, 128), np.uint8)),
     }
     return View(release=released(0), defense=Affine(), extractor=Sift(), knowledge={what: known[what] for what in needs})
 
@@ -219,16 +220,16 @@ def released(seed: int) -> Subspaces:
     rng = np.random.default_rng(seed)
     bases = np.linalg.qr(rng.normal(size=(5, 128, 2)))[0].transpose(0, 2, 1).astype(np.float32)
     return Subspaces(
-        keypoints=np.zeros((5, 2), np.float32), size=(9, 9), origins=rng.normal(size=(5, 128)).astype(np.float32), bases=bases
+        positions=Points(keypoints=np.zeros((5, 2), np.float32)), size=(9, 9), origins=rng.normal(size=(5, 128)).astype(np.float32), bases=bases
     )
 
 
 def summed(view: View, rng: np.random.Generator) -> np.ndarray:
     """Uses all that it is given, and tells what it has not been given."""
-    others = list(view.know(Knowledge.OTHER_RELEASES)(3))
-    view.notes.append(view.know(Knowledge.PUBLIC_DATABASE))
+    others = list(view.know(OtherReleases).draw(3))
+    view.notes.append(f"{len(view.know(PublicDatabase).words)} words")
     try:
-        view.know(Knowledge.DATABASE)
+        view.know(DefenseDatabase)
     except PermissionError as error:
         view.notes.append(str(error))
     return np.asarray(sum(other.origins for other in others) + rng.normal(size=(5, 128)), np.float32)
@@ -239,28 +240,28 @@ def broken(view: View, rng: np.random.Generator) -> np.ndarray:
 
 
 def test_the_other_process_does_as_this_one() -> None:
-    needs = frozenset({Knowledge.OTHER_RELEASES, Knowledge.PUBLIC_DATABASE})
+    needs = frozenset({OtherReleases, PublicDatabase})
     here, there = seen(needs), seen(needs)
     one, other = np.random.default_rng(3), np.random.default_rng(3)
     assert np.array_equal(execute_in_attack_process(summed, there, other), summed(here, one))
-    assert here.notes == there.notes == ["a database", "this attack did not declare DATABASE in its `needs`"]
+    assert here.notes == there.notes == ["3 words", "this attack did not declare DefenseDatabase in its `needs`"]
     assert one.random() == other.random()
 
 
 def camera_and_references(view: View, rng: np.random.Generator) -> np.ndarray:
-    served = view.know(Knowledge.MAP)
-    assert not served.place.scene.queries
-    names = [reference.name for reference in served.place.scene.references]
+    served = view.know(ServerMap).server
+    assert not served.scene_index.scene.queries
+    names = [reference.name for reference in served.scene_index.scene.references]
     return np.array([served.camera.params[0], len(names), names[0].count("/")], np.float32)
 
 
 def test_the_map_comes_without_the_queries(tmp_path: Path) -> None:
     """One of which is the secret."""
-    whole = scene(tmp_path)
-    public = Public(place=Place(whole, Sift()))
+    whole = write_scene(tmp_path)
+    public = Public(scene_index=SceneIndex(whole, Sift()))
     asked = seen(frozenset())
     served = Server(public=public, camera=whole.queries[0].camera)
-    asked = dataclasses.replace(asked, knowledge={Knowledge.MAP: lambda: served})
+    asked = dataclasses.replace(asked, knowledge={ServerMap: lambda: ServerMap(server=served)})
     found = execute_in_attack_process(camera_and_references, asked, np.random.default_rng(0))
     assert found.tolist() == [np.float32(75.1), len(whole.references), 1]
 

@@ -23,7 +23,7 @@ NA = record("*", run_hash="n", attack={"name": "nearest"}, status="n/a", reason=
 def test_metrics_are_averaged_over_photographs() -> None:
     metrics = {"mae": 0.3, "psnr": None, "ssim": 0.7, "keypoints": 300}
     other = record("b", metrics=metrics, privacy=record()["privacy"] | {"epsilon_image": 3000.0})
-    (table,) = tables.tables([record(), other])
+    (table,) = tables.build_tables([record(), other])
     row = table.frame.iloc[0]
     assert row["photographs"] == 2
     assert row["mae"] == pytest.approx(0.2)
@@ -40,8 +40,8 @@ def localized(unit: str, recall: float, error: float | None) -> dict[str, Any]:
 def test_a_query_that_was_not_localized_is_the_worst_of_the_median() -> None:
     """Negative control: averaged over those that survived, the error would be 0.2."""
     queries = [localized("a", 1.0, 0.1), localized("b", 1.0, 0.3), localized("c", 0.0, None), localized("d", 0.0, None)]
-    (half,) = tables.tables(queries)
-    (most,) = tables.tables([*queries, localized("e", 1.0, 0.2)])
+    (half,) = tables.build_tables(queries)
+    (most,) = tables.build_tables([*queries, localized("e", 1.0, 0.2)])
     assert half.frame.iloc[0]["translation_error"] == math.inf
     assert most.frame.iloc[0]["translation_error"] == pytest.approx(0.3)
     assert "| median translation_error |" in tables.to_markdown(half)
@@ -49,7 +49,7 @@ def test_a_query_that_was_not_localized_is_the_worst_of_the_median() -> None:
 
 
 def test_shares_have_wilson_s_interval() -> None:
-    (table,) = tables.tables(
+    (table,) = tables.build_tables(
         [localized(str(number), float(number < 7), 0.1) for number in range(10)] + [NA | {"task": "localization"}]
     )
     expected = stats.binomtest(7, 10).proportion_ci(0.95, "wilson")
@@ -61,7 +61,7 @@ def test_shares_have_wilson_s_interval() -> None:
 
 def test_the_smaller_of_two_compositions_is_shown() -> None:
     optimal = record("b", privacy=record()["privacy"] | {"epsilon_image": 3000.0, "epsilon_image_optimal": 2500.0})
-    (table,) = tables.tables([optimal])
+    (table,) = tables.build_tables([optimal])
     assert table.frame.iloc[0]["epsilon_image"] == 2500.0
     shown = tables.to_markdown(table)
     assert "2500" in shown
@@ -71,26 +71,26 @@ def test_the_smaller_of_two_compositions_is_shown() -> None:
 
 def test_what_is_not_covered_beyond_that_is_noted() -> None:
     linked = record()["privacy"] | {"uncovered": ["the keypoints' positions", "which keypoints share a word"]}
-    (table,) = tables.tables([record(privacy=linked)])
+    (table,) = tables.build_tables([record(privacy=linked)])
     assert table.frame.iloc[0]["note"] == "not covered either: which keypoints share a word"
-    assert tables.tables([record()])[0].frame.iloc[0]["note"] == ""
+    assert tables.build_tables([record()])[0].frame.iloc[0]["note"] == ""
 
 
 def test_a_terminal_shows_how_many_keypoints_there_are() -> None:
-    drawn = tables.to_rich(tables.tables([record()])[0])
+    drawn = tables.to_rich(tables.build_tables([record()])[0])
     assert "keypoints" in [str(column.header) for column in drawn.columns]
 
 
 def test_heading_states_what_was_measured() -> None:
-    (table,) = tables.tables([record()])
+    (table,) = tables.build_tables([record()])
     assert table.heading == "Reconstruction on photos (1 photograph), sift upright features, seed 0"
     oriented = record(run_hash="o", dataset={"name": "photos", "extractor": {"name": "sift", "upright": False}})
-    assert [table.heading.count("oriented") for table in tables.tables([record(), oriented])] == [0, 1]
+    assert [table.heading.count("oriented") for table in tables.build_tables([record(), oriented])] == [0, 1]
     assert "not private" in tables.to_markdown(table)
 
 
 def test_what_does_not_apply_is_neither_blank_nor_zero() -> None:
-    (table,) = tables.tables([record(), NA])
+    (table,) = tables.build_tables([record(), NA])
     shown = tables.rendered(table)
     assert list(shown.loc[1, ["n", "MAE", "SSIM", "PSNR"]]) == ["n/a"] * 4
     assert shown.loc[1, "note"] == "nearest attacks Subspaces"
@@ -102,24 +102,24 @@ def test_what_does_not_apply_is_neither_blank_nor_zero() -> None:
 
 def test_failures_are_counted_and_told() -> None:
     failed = record("b", status="failed", reason="b.jpg: truncated", metrics={})
-    (table,) = tables.tables([record(), failed])
+    (table,) = tables.build_tables([record(), failed])
     assert (table.frame.loc[0, "photographs"], table.frame.loc[0, "failed"]) == (1, 1)
     assert "failed: b, ldp:epsilon=10, dia: b.jpg: truncated" in tables.to_markdown(table)
-    (all_failed,) = tables.tables([failed])
+    (all_failed,) = tables.build_tables([failed])
     assert all_failed.frame.loc[0, "note"] == "no photograph could be done"
 
 
 def test_later_record_of_a_unit_replaces_the_earlier() -> None:
     failed = record(status="failed", reason="x", metrics={})
-    (table,) = tables.tables([failed, record()])
+    (table,) = tables.build_tables([failed, record()])
     assert (table.frame.loc[0, "photographs"], table.frame.loc[0, "failed"]) == (1, 0)
 
 
 def test_labels_show_digests_only_where_they_tell_apart() -> None:
     one, other = record(), record(defense=record()["defense"] | {"dictionary": "sha256:fedcba9876"}, run_hash="o")
-    (table,) = tables.tables([one, other])
+    (table,) = tables.build_tables([one, other])
     assert list(table.frame["defense"]) == ["ldp:epsilon=10,dictionary=01234567", "ldp:epsilon=10,dictionary=fedcba98"]
-    (table,) = tables.tables([one, NA])
+    (table,) = tables.build_tables([one, NA])
     assert list(table.frame["defense"]) == ["ldp:epsilon=10"] * 2
 
 
@@ -127,19 +127,19 @@ def test_labels_show_digests_only_where_they_tell_apart() -> None:
     ("log10", "shown"), [(-0.8332, "0.1468"), (0.0, "1"), (-612.25, "10^-612.2"), (math.nan, "n/a"), (None, "n/a")]
 )
 def test_chances_too_small_for_a_float_are_shown(log10: float | None, shown: str) -> None:
-    (table,) = tables.tables([record(privacy=record()["privacy"] | {"log10_true": log10})])
+    (table,) = tables.build_tables([record(privacy=record()["privacy"] | {"log10_true": log10})])
     assert tables.rendered(table).loc[0, "Pr(true)"] == shown
 
 
 def test_infinite_epsilon_is_shown() -> None:
     privacy = record()["privacy"] | {"epsilon_descriptor": "inf", "epsilon_image": "inf"}
-    (table,) = tables.tables([record(privacy=privacy)])
+    (table,) = tables.build_tables([record(privacy=privacy)])
     assert tables.rendered(table).loc[0, "ε/descriptor"] == "∞"
     assert tables.rendered(table).loc[0, "ε/image"] == "∞"
 
 
 def test_terminal_and_markdown_show_the_same_cells() -> None:
-    (table,) = tables.tables([record(), NA])
+    (table,) = tables.build_tables([record(), NA])
     console = Console(file=io.StringIO(), width=300)
     console.print(tables.to_rich(table))
     drawn = console.file.getvalue()  # type: ignore[attr-defined]
@@ -149,7 +149,7 @@ def test_terminal_and_markdown_show_the_same_cells() -> None:
 
 
 def test_pipe_in_a_reason_does_not_break_markdown() -> None:
-    (table,) = tables.tables([NA | {"reason": "a|b\nc"}])
+    (table,) = tables.build_tables([NA | {"reason": "a|b\nc"}])
     assert r"a\|b c" in tables.to_markdown(table)
 
 
@@ -159,9 +159,9 @@ def test_figure_has_a_panel_for_each_record(tmp_path: Path) -> None:
     kept = tmp_path / "kept.png"
     Image.fromarray(np.zeros((256, 256, 3), np.uint8)).save(kept)
     failed = record(status="failed", reason="too $dark$ " * 20, run_hash="f", metrics={})
-    shown = figures.panels(np.zeros((256, 256, 3), np.uint8), [record(), failed], [kept, tmp_path / "absent"])
+    shown = figures.build_panels(np.zeros((256, 256, 3), np.uint8), [record(), failed], [kept, tmp_path / "absent"])
     assert [panel.title for panel in shown] == ["original", "ldp:epsilon=10\ndia", "ldp:epsilon=10\ndia"]
-    assert [panel.beneath[:10] for panel in shown] == ["", "SSIM 0.500", "failed: to"]
+    assert [panel.caption[:10] for panel in shown] == ["", "SSIM 0.500", "failed: to"]
     assert shown[2].pixels is None
     for panels in (shown, shown * 3):
         figures.draw(panels, "a").savefig(tmp_path / "figure.png")

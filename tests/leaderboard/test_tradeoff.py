@@ -9,19 +9,19 @@ import pytest
 from fabricated import DIA, ENVIRONMENT, GALLERY, PHOTOGRAPHS, inapplicable, ldp, localizations, reconstructions, record
 
 from leaderboard import comparison, plots
-from leaderboard.comparison import Board
-from leaderboard.plot_style import MARKS, marks, place_labels
-from leaderboard.site.chart import charts
-from leaderboard.tradeoff import Tradeoff, pareto, tradeoffs
+from leaderboard.comparison import ComparisonGroup
+from leaderboard.plot_style import STYLES, choose_styles, place_labels
+from leaderboard.site.chart import build_charts
+from leaderboard.tradeoff import Tradeoff, build_tradeoffs, pareto
 
 NONE = {"name": "none"}
 DAYS = ["day", "day", "night", "night"]
 
 
 def joined(tmp_path: Path, *groups: list[dict[str, Any]]) -> list[Tradeoff]:
-    found = comparison.boards(comparison.find(fabricated.write(tmp_path, [record for group in groups for record in group])))
-    attacked: Board = next(board for board in found if board.attacked)
-    return tradeoffs(attacked, found)
+    found = comparison.build_groups(comparison.load_records(fabricated.write(tmp_path, [record for group in groups for record in group])))
+    attacked: ComparisonGroup = next(board for board in found if board.attacked)
+    return build_tradeoffs(attacked, found)
 
 
 def dominated(cost: np.ndarray, gain: np.ndarray) -> list[bool]:
@@ -90,7 +90,7 @@ def test_a_server_that_works_otherwise_has_a_plot_of_its_own(tmp_path: Path) -> 
         "SSIM on photos, recall (0.25 m, 2°) on gallery (retrieval raw)": 1.0,
         "SSIM on photos, recall (0.25 m, 2°) on gallery (retrieval released)": 0.0,
     }
-    names = [name for name, _ in plots.plots(found[0].attacked, found)]
+    names = [name for name, _ in plots.draw_plots(found[0].attacked, found)]
     assert len(set(names)) == len(names)
 
 
@@ -132,12 +132,12 @@ def test_an_unranked_defense_is_shown_and_is_on_no_front(tmp_path: Path) -> None
 
 def test_families_differ_without_colour() -> None:
     assert (
-        len({mark.marker for mark in MARKS})
-        == len({mark.path for mark in MARKS})
-        == len({str(mark.line) for mark in MARKS})
-        == len(MARKS)
+        len({mark.marker for mark in STYLES})
+        == len({mark.path for mark in STYLES})
+        == len({str(mark.line) for mark in STYLES})
+        == len(STYLES)
     )
-    assert list(marks(["b", "a", "b"])) == ["b", "a"]
+    assert list(choose_styles(["b", "a", "b"])) == ["b", "a"]
 
 
 def test_labels_cover_nothing() -> None:
@@ -177,8 +177,8 @@ def test_plots_are_drawn_of_what_there_is(tmp_path: Path) -> None:
         *localizations(NONE, [1, 1], [None, None]),
         *localizations(ldp(8.0), [1, 0], [None, None]),
     ]
-    found = comparison.boards(comparison.find(fabricated.write(tmp_path, records)))
-    drawn = dict(plots.plots(found[0], tradeoffs(found[0], found)))
+    found = comparison.build_groups(comparison.load_records(fabricated.write(tmp_path, records)))
+    drawn = dict(plots.draw_plots(found[0], build_tradeoffs(found[0], found)))
     assert list(drawn) == ["attacks", "epsilon", "tradeoff"]
     (axes,) = drawn["tradeoff"].axes
     assert {text.get_text() for text in axes.texts} == {"none", "ldp"}
@@ -195,7 +195,7 @@ def test_the_pages_plot_lies_where_the_numbers_say(tmp_path: Path) -> None:
         localizations(NONE, [1, 1, 1, 0], DAYS),
         localizations(ldp(8.0), [1, 0, 0, 0], DAYS),
     )
-    day, night = charts(found)
+    day, night = build_charts(found)
     for chart in (day, night):
         left, top, right, bottom = chart.box
         undefended, defended = sorted(chart.spots, key=lambda spot: spot.y)

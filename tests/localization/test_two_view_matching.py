@@ -6,18 +6,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fakes import texture, trial
+from fakes import draw_texture, build_trial
 
 import bench
-from bench.api import Asset, Defense, Outcome
-from bench.codebook.examples import example_features, small_dictionary
+from bench.api import Defense
+from bench.codebook.examples import draw_features, write_dictionary
 from bench.codebook.public import Public
 from bench.core.errors import UserError
-from bench.geometry.shared_words import sharing
+from bench.geometry.shared_words import find_shared_words
 from bench.images.scene import File
 from bench.localization import two_view_matching
 from bench.rendering.homographies import Pair
-from bench.tasks.matching import WITHIN, Matching, accuracy, transferred
+from bench.settings import Asset
+from bench.task_api import Outcome
+from bench.tasks.matching import ACCURACY_LIMITS, Matching, compute_accuracy, transfer
 from bench.testing import shot
 from bench.types import Features, Release
 from defenses.affine import Affine
@@ -25,13 +27,13 @@ from defenses.ldp import LDP
 from defenses.naive_ldp import NaiveLDP
 from defenses.none import Undefended
 
-SECRET = example_features(60, seed=3)
+SECRET = draw_features(60, seed=3)
 TURN = np.array([[0.9, 0.1, 3.0], [-0.1, 0.9, 8.0], [1e-3, 0, 1]])
 
 
 @pytest.fixture
 def words(tmp_path: Path) -> Asset:
-    return small_dictionary(tmp_path, 5_000)
+    return write_dictionary(tmp_path, 5_000)
 
 
 def test_measures_by_enumeration(rng: np.random.Generator) -> None:
@@ -45,28 +47,28 @@ def test_measures_by_enumeration(rng: np.random.Generator) -> None:
     errors = np.array([error[i, j] for i, j in matches])
     possible = {i for i in range(40) if error[i].min() < 3}
     right = {int(i) for (i, _), off in zip(matches, errors, strict=True) if off < 3}
-    found = accuracy(first, second, TURN, matches)
+    found = compute_accuracy(first, second, TURN, matches)
     assert found["correspondences"] == len(possible)
     assert found["recall"] == pytest.approx(len(right & possible) / len(possible))
     assert found["precision"] == found["mma_03px"] == pytest.approx((errors < 3).mean())
-    assert [found[f"mma_{t:02}px"] for t in WITHIN] == pytest.approx([(errors < t).mean() for t in WITHIN])
+    assert [found[f"mma_{t:02}px"] for t in ACCURACY_LIMITS] == pytest.approx([(errors < t).mean() for t in ACCURACY_LIMITS])
     assert 0 < len(right) < len(possible) < 40
 
 
 def test_where_nothing_is_matched_all_is_zero() -> None:
     points = np.array([[5, 5], [9, 9]], np.float32)
-    found = accuracy(points, points, np.eye(3), np.empty((0, 2), np.int64))
+    found = compute_accuracy(points, points, np.eye(3), np.empty((0, 2), np.int64))
     assert (found["precision"], found["recall"], found["mma_10px"], found["matches"]) == (0, 0, 0, 0)
-    assert accuracy(points, points + 50, np.eye(3), np.empty((0, 2), np.int64))["recall"] is None
+    assert compute_accuracy(points, points + 50, np.eye(3), np.empty((0, 2), np.int64))["recall"] is None
 
 
 def test_points_beyond_the_horizon_have_no_place() -> None:
     behind = np.array([[1, 0, 0], [0, 1, 0], [-0.1, 0, 1.0]])
-    found = transferred(np.array([[5, 5], [10, 5], [20, 5]], np.float32), behind)
+    found = transfer(np.array([[5, 5], [10, 5], [20, 5]], np.float32), behind)
     assert np.isfinite(found[0]).all()
     assert np.isinf(found[1:]).all()
     points = np.array([[20, 5]], np.float32)
-    assert accuracy(points, points, behind, np.array([[0, 0]]))["precision"] == 0
+    assert compute_accuracy(points, points, behind, np.array([[0, 0]]))["precision"] == 0
 
 
 @pytest.mark.parametrize("unique", [False, True])
@@ -75,15 +77,20 @@ def test_words_in_common_by_enumeration(rng: np.random.Generator, unique: bool) 
     counts = [np.bincount(words.ravel(), minlength=60) for words in (first, second)]
     good = np.flatnonzero((counts[0] == 1) & (counts[1] == 1) | (not unique))
     expected = [[i, j] for i in range(15) for j in range(12) if set(first[i]) & set(second[j]) & set(good)]
-    assert sharing(first, second, unique).tolist() == expected
+    assert find_shared_words(first, second, unique).tolist() == expected
     assert 0 < len(expected) < 15 * 12
 
 
 def test_words_in_common_where_there_is_little() -> None:
     none, some = np.empty((0, 3), dtype=np.int64), np.array([[1, 2, 3], [1, 4, 5]])
-    assert sharing(none, some).shape == sharing(some, none).shape == sharing(some, some + 10).shape == (0, 2)
-    assert sharing(some, some, unique=True).tolist() == [[0, 0], [1, 1]]
-    assert sharing(some, some).tolist() == [[0, 0], [0, 1], [1, 0], [1, 1]]
+    assert (
+        find_shared_words(none, some).shape
+        == find_shared_words(some, none).shape
+        == find_shared_words(some, some + 10).shape
+        == (0, 2)
+    )
+    assert find_shared_words(some, some, unique=True).tolist() == [[0, 0], [1, 1]]
+    assert find_shared_words(some, some).tolist() == [[0, 0], [0, 1], [1, 0], [1, 1]]
 
 
 def released(defense: Defense, secret: Features = SECRET, seed: int = 0) -> Release:
@@ -102,8 +109,8 @@ DEFENSES: list[Callable[[Asset], Defense]] = [
 @pytest.mark.parametrize("both", [False, True])
 def test_the_same_features_match_themselves(words: Asset, defense: Callable[[Asset], Defense], both: bool) -> None:
     plugin = defense(words)
-    second = released(plugin, seed=1) if both else two_view_matching.unprotected(SECRET, plugin, Public())
-    found = {tuple(pair) for pair in two_view_matching.matches(released(plugin), second).tolist()}
+    second = released(plugin, seed=1) if both else two_view_matching.prepare_unprotected(SECRET, plugin, Public())
+    found = {tuple(pair) for pair in two_view_matching.match_releases(released(plugin), second).tolist()}
     assert len({(i, i) for i in range(60)} & found) > 55
     assert len(found) < 120
 
@@ -112,13 +119,13 @@ def test_the_same_features_match_themselves(words: Asset, defense: Callable[[Ass
 def test_strangers_do_not_match_more_than_chance(words: Asset, defense: Callable[[Asset], Defense]) -> None:
     """Negative control: descriptors in another order."""
     plugin, shuffled = defense(words), SECRET.take(np.random.default_rng(0).permutation(60))
-    found = two_view_matching.matches(released(plugin), two_view_matching.unprotected(shuffled, plugin, Public()))
+    found = two_view_matching.match_releases(released(plugin), two_view_matching.prepare_unprotected(shuffled, plugin, Public()))
     assert (found[:, 0] == found[:, 1]).mean() < 0.15
 
 
 def judged(task: Matching, defense: Defense, secrets: tuple[Features, Features], homography: np.ndarray) -> Outcome:
     """What a task says of a pair without photographs."""
-    made = trial(defense, secrets[0])
+    made = build_trial(defense, secrets[0])
     other = shot(secrets[1], released(defense, secrets[1], seed=5))
     nowhere = File(path=Path("none"), size=(1, 1))
     pair = Pair(name="pair", first=nowhere, second=nowhere, homography=homography)
@@ -129,7 +136,7 @@ def judged(task: Matching, defense: Defense, secrets: tuple[Features, Features],
 def seen_again(homography: np.ndarray) -> tuple[Features, Features]:
     keypoints = np.random.default_rng(0).uniform(0, 300, (60, 2)).astype(np.float32)
     first = replace(SECRET, keypoints=keypoints)
-    return first, replace(SECRET, keypoints=transferred(keypoints, homography).astype(np.float32))
+    return first, replace(SECRET, keypoints=transfer(keypoints, homography).astype(np.float32))
 
 
 @pytest.mark.parametrize("homography", [np.eye(3), TURN])
@@ -150,24 +157,24 @@ def test_shuffled_positions_give_chance() -> None:
 def test_another_dictionary_matches_nothing(tmp_path: Path, words: Asset) -> None:
     """Negative control: the same numbers stand for other words."""
     release = released(LDP(dictionary=words, epsilon=20.0))
-    stranger = LDP(dictionary=small_dictionary(tmp_path, 5_000, seed=7), epsilon=20.0)
-    assert len(two_view_matching.matches(release, two_view_matching.unprotected(SECRET, stranger, Public()))) < 10
+    stranger = LDP(dictionary=write_dictionary(tmp_path, 5_000, seed=7), epsilon=20.0)
+    assert len(two_view_matching.match_releases(release, two_view_matching.prepare_unprotected(SECRET, stranger, Public()))) < 10
 
 
 def test_ratio_test_leaves_fewer_and_better_matches() -> None:
-    first, second = example_features(60, seed=1), example_features(80, seed=2)
-    all_of_them = two_view_matching.matches(released(Undefended(), first), released(Undefended(), second))
-    strict = two_view_matching.matches(released(Undefended(), first), released(Undefended(), second), ratio=0.8)
+    first, second = draw_features(60, seed=1), draw_features(80, seed=2)
+    all_of_them = two_view_matching.match_releases(released(Undefended(), first), released(Undefended(), second))
+    strict = two_view_matching.match_releases(released(Undefended(), first), released(Undefended(), second), ratio=0.8)
     assert {tuple(pair) for pair in strict} < {tuple(pair) for pair in all_of_them}
 
 
 def test_runs_on_hpatches_and_on_pairs_that_are_made(tmp_path: Path) -> None:
     (tmp_path / "v_wall").mkdir()
     for number in range(1, 7):
-        texture(0, (160, 128)).save(tmp_path / "v_wall" / f"{number}.ppm")
+        draw_texture(0, (160, 128)).save(tmp_path / "v_wall" / f"{number}.ppm")
         np.savetxt(tmp_path / "v_wall" / f"H_1_{number}", np.eye(3))
     records = bench.run([Undefended()], images=tmp_path, task=Matching())
-    assert [record["unit"] for record in records] == [f"v_wall-{number}" for number in range(2, 7)]
+    assert [record["sample"] for record in records] == [f"v_wall-{number}" for number in range(2, 7)]
     assert all(record["metrics"]["recall"] == record["metrics"]["mma_01px"] == 1 for record in records)
 
 

@@ -11,32 +11,32 @@ import pytest
 
 from bench import cli
 from bench.core.errors import UserError
-from bench.mechanisms.budget import budget, nearest, yields
-from bench.mechanisms.composition import basic, optimal
-from bench.mechanisms.subset import word_subsets
+from bench.mechanisms.budget import compute_yields, divide_budget, select_nearest_records
+from bench.mechanisms.composition import compose_basic, compose_optimal
+from bench.mechanisms.subset import draw_word_subsets
 
 
 def test_what_is_left_costs_what_was_asked() -> None:
-    plan = budget(10.0, 800, 3, 256_000)
-    assert plan.by_basic == pytest.approx(10 / 2400)
-    assert basic(plan.by_basic, 2400) == pytest.approx(10)
-    assert optimal(plan.by_optimal, 2400) == pytest.approx(10)
-    assert plan.epsilon == plan.by_optimal > plan.by_basic
+    plan = divide_budget(10.0, 800, 3, 256_000)
+    assert plan.basic_epsilon == pytest.approx(10 / 2400)
+    assert compose_basic(plan.basic_epsilon, 2400) == pytest.approx(10)
+    assert compose_optimal(plan.optimal_epsilon, 2400) == pytest.approx(10)
+    assert plan.epsilon == plan.optimal_epsilon > plan.basic_epsilon
     # Where each answer costs much, a small δ buys nothing.
-    assert budget(8000.0, 800, 1, 256_000).epsilon == pytest.approx(10.0, rel=1e-6)
+    assert divide_budget(8000.0, 800, 1, 256_000).epsilon == pytest.approx(10.0, rel=1e-6)
 
 
 def test_what_that_gives_is_what_the_mechanism_gives() -> None:
-    plan = budget(8000.0, 800, 1, 1000)
-    assert [row.size for row in yields(plan)] == [1, 2, 4]  # at ε = 10 of 1000 words, one is the best size
-    plan = budget(optimal(3.0, 800), 800, 1, 1000)
-    rows = {row.size: row for row in yields(plan)}
+    plan = divide_budget(8000.0, 800, 1, 1000)
+    assert [row.size for row in compute_yields(plan)] == [1, 2, 4]  # at ε = 10 of 1000 words, one is the best size
+    plan = divide_budget(compose_optimal(3.0, 800), 800, 1, 1000)
+    rows = {row.size: row for row in compute_yields(plan)}
     assert set(rows) == {1, 2, 4, 47, 113}  # 1000 / (e³ + 1), and where mutual information is greatest
     rng = np.random.default_rng(0)
     true = rng.integers(1000, size=50_000)
     for size, row in rows.items():
-        told = (word_subsets(true, 1000, 3.0, size, rng) == true[:, None]).any(axis=1).mean()
-        assert row.told == pytest.approx(told, abs=0.01)
+        told = (draw_word_subsets(true, 1000, 3.0, size, rng) == true[:, None]).any(axis=1).mean()
+        assert row.inclusion == pytest.approx(told, abs=0.01)
         assert row.true_words == pytest.approx(800 * told, abs=8)
     assert max(rows.values(), key=lambda row: row.bits).size == 113
 
@@ -46,10 +46,10 @@ def test_the_records_of_the_nearest_epsilon() -> None:
         return {"privacy": {"epsilon_descriptor": epsilon}}
 
     records = [record(epsilon) for epsilon in (None, 8.0, 10.0, 8.0, "inf", 0.0)]
-    assert nearest(records, 8.9) == [record(8.0)] * 2
-    assert nearest(records, 0.1) == [record(0.0)]
+    assert select_nearest_records(records, 8.9) == [record(8.0)] * 2
+    assert select_nearest_records(records, 0.1) == [record(0.0)]
     with pytest.raises(UserError, match="no record there claims an epsilon"):
-        nearest([record(None)], 1.0)
+        select_nearest_records([record(None)], 1.0)
 
 
 @pytest.mark.parametrize(
@@ -64,7 +64,7 @@ def test_the_records_of_the_nearest_epsilon() -> None:
 )
 def test_mistakes(numbers: Any, complaint: str) -> None:
     with pytest.raises(UserError, match=complaint):
-        budget(*numbers)
+        divide_budget(*numbers)
 
 
 def run(capfd: pytest.CaptureFixture[str], *arguments: Any) -> tuple[int, str, str]:
@@ -77,7 +77,7 @@ def test_the_command(capfd: pytest.CaptureFixture[str]) -> None:
     assert status == 0
     assert "basic composition leaves ε = 0.01 for a descriptor" in shown
     left = float(re.search(r"δ = 1e-06 leaves ε = ([0-9.]+)", shown)[1])  # type: ignore[index]
-    assert optimal(left, 1000) == pytest.approx(10, rel=1e-3)
+    assert compose_optimal(left, 1000) == pytest.approx(10, rel=1e-3)
     assert "not covered: the keypoints' positions, the number of keypoints" in shown
     assert run(capfd, "--image-epsilon", "1/0")[0] == 2
     assert run(capfd)[2] == "bench: --image-epsilon is missing (bench budget --help explains)\n"

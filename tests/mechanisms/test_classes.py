@@ -25,7 +25,7 @@ def exp_bounds(power: Fraction, terms: int = 120) -> tuple[Fraction, Fraction]:
     return total, total + term
 
 
-def cumulated(counts: list[int], powers: list[Fraction], bits: int) -> list[int]:
+def compute_reference_edges(counts: list[int], powers: list[Fraction], bits: int) -> list[int]:
     """What `edges` returns, from rationals alone."""
     least = min(powers)
     bounds = [exp_bounds(power - least) for power in powers]
@@ -49,7 +49,7 @@ def cumulated(counts: list[int], powers: list[Fraction], bits: int) -> list[int]
 )
 def test_edges_against_rational_arithmetic(counts: list[int], step: Fraction, bits: int) -> None:
     powers = [step * place for place in range(len(counts))]
-    assert edges(counts, powers, bits) == cumulated(counts, powers, bits)
+    assert edges(counts, powers, bits) == compute_reference_edges(counts, powers, bits)
 
 
 def test_two_classes_are_the_coin_of_the_subset_mechanism() -> None:

@@ -12,21 +12,21 @@ from typing import Any
 import jsonschema
 import numpy as np
 import pytest
-from fakes import album
+from fakes import write_album
 from scipy import stats
 
 import bench
 from attacks import keypoints
 from bench.api import Defense
-from bench.audit.auditor import audit, near_words
-from bench.codebook.examples import example_features, small_dictionary
+from bench.audit.auditor import audit, create_features_near_words
+from bench.codebook.examples import draw_features, write_dictionary
 from bench.codebook.public import ASSETS, Public
 from bench.core.errors import UserError
 from bench.core.exact import Exact
 from bench.geometry.nearest_words import unit_rows
 from bench.geometry.neighbours import Neighbours
 from bench.mechanisms import budget
-from bench.mechanisms.graded import graded_words
+from bench.mechanisms.graded import draw_graded_words
 from bench.types import Features, WordSets
 from defenses.exponential import Exponential
 from defenses.metric_ldp import MetricLDP
@@ -50,13 +50,13 @@ def chances(weights: np.ndarray, size: int) -> dict[tuple[int, ...], float]:
 
 @pytest.mark.parametrize("size", [1, 2, 3])
 def test_words_against_enumeration(size: int) -> None:
-    codes, draws = example_features(7, 2).codes, 60_000
+    codes, draws = draw_features(7, 2).codes, 60_000
     assert codes is not None
     unit = unit_rows(codes).astype(np.float64)
     cosines = unit @ unit[3]
     borders = np.quantile(cosines, [0.3, 0.6, 0.9])
     powers = [Fraction(level, 2) for level in range(4)]
-    drawn = graded_words(Neighbours(codes), np.full(draws, 3), borders, powers, size, np.random.default_rng(0))
+    drawn = draw_graded_words(Neighbours(codes), np.full(draws, 3), borders, powers, size, np.random.default_rng(0))
     assert (np.diff(drawn, axis=1) > 0).all()
     seen = Counter(map(tuple, drawn.tolist()))
     levels = (cosines[:, None] >= borders - 1e-12).sum(axis=1)
@@ -66,7 +66,7 @@ def test_words_against_enumeration(size: int) -> None:
         assert p > ALPHA if right else p < 1e-6
 
 
-def released(defense: Defense, secrets: Features, public: Public, draws: int) -> np.ndarray:
+def measure_frequencies(defense: Defense, secrets: Features, public: Public, draws: int) -> np.ndarray:
     """Frequencies of words. -> (secrets, K)"""
     found = []
     for row in range(len(secrets)):
@@ -78,24 +78,28 @@ def released(defense: Defense, secrets: Features, public: Public, draws: int) ->
 
 
 def test_exponential_has_the_law_of_its_docstring(tmp_path: Path) -> None:
-    public, asset = Public(), small_dictionary(tmp_path, 12)
+    public, asset = Public(), write_dictionary(tmp_path, 12)
     defense = Exponential(epsilon=6.0, floor=0.3, levels=5, dictionary=asset)
-    secrets = near_words(defense, public)
+    secrets = create_features_near_words(defense, public)
     unit = unit_rows(public.dictionary(asset).words).astype(np.float64)
     utility = np.floor((unit @ unit.T - 0.3) / 0.7 * 5 + 1e-6).clip(0) / 5
     weights = np.exp(6.0 * utility / 2)
-    np.testing.assert_allclose(released(defense, secrets, public, 20_000), weights / weights.sum(1, keepdims=True), atol=0.02)
+    np.testing.assert_allclose(
+        measure_frequencies(defense, secrets, public, 20_000), weights / weights.sum(1, keepdims=True), atol=0.02
+    )
     assert defense.privacy(public).epsilon == 6.0
 
 
 def test_metric_ldp_has_the_law_of_its_docstring(tmp_path: Path) -> None:
-    public, asset = Public(), small_dictionary(tmp_path, 12)
+    public, asset = Public(), write_dictionary(tmp_path, 12)
     defense = MetricLDP(epsilon=5.0, steps=4, dictionary=asset)
-    secrets = near_words(defense, public)
+    secrets = create_features_near_words(defense, public)
     unit = unit_rows(public.dictionary(asset).words).astype(np.float64)
     distances = np.ceil(np.linalg.norm(unit[:, None] - unit, axis=2) * 4 - 1e-5) / 4
     weights = np.exp(-5.0 * distances / 2)
-    np.testing.assert_allclose(released(defense, secrets, public, 20_000), weights / weights.sum(1, keepdims=True), atol=0.02)
+    np.testing.assert_allclose(
+        measure_frequencies(defense, secrets, public, 20_000), weights / weights.sum(1, keepdims=True), atol=0.02
+    )
     # The metric that the promise is made in covers the rounded distances, and is one.
     promised = np.array([[float(defense.distance(secrets, public, i, j)) for j in range(12)] for i in range(12)])
     assert (promised >= distances).all()
@@ -107,16 +111,16 @@ def test_metric_ldp_has_the_law_of_its_docstring(tmp_path: Path) -> None:
 
 
 def test_the_promise_by_distance_is_no_epsilon(tmp_path: Path) -> None:
-    promised = MetricLDP(dictionary=small_dictionary(tmp_path)).privacy(Public())
+    promised = MetricLDP(dictionary=write_dictionary(tmp_path)).privacy(Public())
     assert (promised.guarantee, promised.epsilon, promised.per_distance) == ("d-chi", None, 16.0)
-    assert Exponential(dictionary=small_dictionary(tmp_path)).distance(example_features(2), Public(), 0, 1) == 1
+    assert Exponential(dictionary=write_dictionary(tmp_path)).distance(draw_features(2), Public(), 0, 1) == 1
 
 
 def test_it_never_stands_in_a_column_of_epsilons(tmp_path: Path) -> None:
     """Neither in records, nor in tables, nor in a leaderboard's sheets, nor among budgets; and the records are of the schema."""
-    small = small_dictionary(tmp_path)
+    small = write_dictionary(tmp_path)
     defenses = [MetricLDP(dictionary=small), Exponential(dictionary=small)]
-    album(tmp_path / "photos", 1)
+    write_album(tmp_path / "photos", 1)
     records = bench.run(defenses, [keypoints.PLUGIN()], tmp_path / "photos", out=tmp_path / "run")
     privacy = records[0]["privacy"]
     assert (privacy["guarantee"], privacy["epsilon_per_distance"]) == ("d-chi", 16.0)
@@ -125,16 +129,16 @@ def test_it_never_stands_in_a_column_of_epsilons(tmp_path: Path) -> None:
     schema = json.loads((ASSETS / "record.schema.json").read_text(encoding="utf-8"))
     for record in records:
         jsonschema.validate(record, schema)
-    (table,) = tables.tables(records)
+    (table,) = tables.build_tables(records)
     by_distance, by_epsilon = (row for _, row in tables.rendered(table).iterrows())
     assert (by_distance["ε/descriptor"], by_distance["ε/image"], by_epsilon["ε/descriptor"]) == ("n/a", "n/a", "10")
     assert by_distance["note"] == "another promise than ε-LDP: ε = 16 per unit of distance"
-    (board,) = comparison.boards(comparison.find(tmp_path / "run"))
-    rows = {row.cell.head["defense"]["name"]: row.values for row in group_tables.pairs(board).rows}
+    (board,) = comparison.build_groups(comparison.load_records(tmp_path / "run"))
+    rows = {row.cell.metadata["defense"]["name"]: row.values for row in group_tables.pairs(board).rows}
     assert rows["metric-ldp"]["guarantee"] == "d_χ privacy, ε = 16 per unit of distance"
     assert rows["metric-ldp"]["epsilon_descriptor"] is None is rows["metric-ldp"]["epsilon_image"]
     assert rows["exponential"]["epsilon_descriptor"] == 10.0
-    assert {record["defense"]["name"] for record in budget.nearest(records, 16.0)} == {"exponential"}
+    assert {record["defense"]["name"] for record in budget.select_nearest_records(records, 16.0)} == {"exponential"}
 
 
 # ---- the audit
@@ -186,9 +190,9 @@ def test_broken_ones_are_caught(tmp_path: Path) -> None:
     found = audit(WithoutTheTwo(epsilon=Exact("1/3"), floor=0.3), 3, 400, 0, tmp_path)
     assert found.enumeration is not None
     assert found.enumeration.exceeds
-    assert not any(finding.certain > found.claimed for finding in found.findings)  # too little for so few trials
+    assert not any(finding.certain_epsilon > found.claimed for finding in found.findings)  # too little for so few trials
     found = audit(InOtherUnits(epsilon=1.0), 8, 20_000, 0, tmp_path)
-    assert {finding.family for finding in found.findings if finding.certain > 1.0} >= {"membership", "position"}
+    assert {finding.family for finding in found.findings if finding.certain_epsilon > 1.0} >= {"membership", "position"}
 
 
 # ---- what is asked
@@ -213,4 +217,4 @@ def test_mistakes(plugin: Any, given: dict[str, float], complaint: str) -> None:
 
 def test_a_dictionary_may_be_too_small(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="subset_size is 9, but the dictionary has 8 words"):
-        Exponential(subset_size=9, dictionary=small_dictionary(tmp_path, 8)).privacy(Public())
+        Exponential(subset_size=9, dictionary=write_dictionary(tmp_path, 8)).privacy(Public())

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import bench
-from bench.api import Asset
-from bench.codebook.examples import example_features, small_dictionary
+from bench.codebook.examples import draw_features, write_dictionary
 from bench.codebook.public import Public
 from bench.core.errors import UserError
 from bench.mechanisms import protection
+from bench.settings import Asset
 from bench.testing import same
 from bench.types import Descriptors, WordSets
 from defenses.ldp import LDP
@@ -21,7 +21,7 @@ from defenses.none import Undefended
 
 @pytest.fixture
 def small(tmp_path: Path) -> Asset:
-    return small_dictionary(tmp_path)
+    return write_dictionary(tmp_path)
 
 
 def words(release: object) -> np.ndarray:
@@ -31,7 +31,7 @@ def words(release: object) -> np.ndarray:
 
 
 def test_releases_are_drawn_afresh(small: Asset) -> None:
-    features, defense = example_features(), LDP(dictionary=small)
+    features, defense = draw_features(), LDP(dictionary=small)
     assert not same(bench.protect(features, defense), bench.protect(features, defense))
     assert isinstance(bench.protect(features, Undefended()), Descriptors)
 
@@ -44,19 +44,19 @@ def test_the_key_is_the_operating_systems(small: Asset, monkeypatch: pytest.Monk
         return b"\x07" * count
 
     monkeypatch.setattr(protection.secrets, "token_bytes", drawn)
-    features, defense = example_features(), LDP(dictionary=small)
+    features, defense = draw_features(), LDP(dictionary=small)
     first, again = bench.protect(features, defense), bench.protect(features, defense)
     assert asked == [32, 32]
     assert same(first, again)  # a function of these bits alone
-    assert same(first, defense.protect(features, Public(), protection.generator(b"\x07" * 32)))
+    assert same(first, defense.protect(features, Public(), protection.create_generator(b"\x07" * 32)))
 
 
 def test_the_cipher_is_chacha20() -> None:
     """The keystream of RFC 8439, A.1, test vectors 1 and 2 (one key of zeros, blocks 0 and 1), and of a key of its draft."""
-    zeros = protection.generator(bytes(32)).bytes(128)
+    zeros = protection.create_generator(bytes(32)).bytes(128)
     assert zeros[:32].hex() == "76b8e0ada0f13d90405d6ae55386bd28bdd219b8a08ded1aa836efcc8b770dc7"
     assert zeros[64:96].hex() == "9f07e7be5551387a98ba977c732d080dcb0f29a048e3656912c6533e32ee7aed"
-    one = protection.generator(bytes(31) + b"\x01").bytes(32)
+    one = protection.create_generator(bytes(31) + b"\x01").bytes(32)
     assert one.hex() == "4540f05a9f1fb296d7736e7b208e3c96eb4fe1834688d2604f450952ed432d41"
 
 
@@ -64,7 +64,7 @@ def test_the_cipher_is_chacha20() -> None:
 
 
 def test_a_device_gives_equal_words_equal_answers(small: Asset, tmp_path: Path) -> None:
-    defense, features, key = LDP(dictionary=small, memoize=True), example_features(200), tmp_path / "key"
+    defense, features, key = LDP(dictionary=small, memoize=True), draw_features(200), tmp_path / "key"
     first, again = (words(bench.protect(features, defense, device=key)) for _ in range(2))
     np.testing.assert_array_equal(first, again)
     nearest = Public().nearest_words(small, features)
@@ -80,7 +80,7 @@ def test_a_device_gives_equal_words_equal_answers(small: Asset, tmp_path: Path) 
 
 def test_another_configuration_is_another_table(small: Asset, tmp_path: Path) -> None:
     """Under one key, the bits that say whether the true word is told would be the same at every ε."""
-    features, key = example_features(300), tmp_path / "key"
+    features, key = draw_features(300), tmp_path / "key"
     key.write_bytes(bytes(range(32)))  # one device: the share told is a matter of its draws
     rows = [words(bench.protect(features, LDP(dictionary=small, memoize=True, epsilon=e), device=key)) for e in (4.0, 4.01)]
     nearest = Public().nearest_words(small, features)
@@ -88,7 +88,7 @@ def test_another_configuration_is_another_table(small: Asset, tmp_path: Path) ->
     assert 0.02 < told[0].mean() < 0.5
     assert (told[0] != told[1]).mean() > 0.02
     alike = [
-        LDP(dictionary=small, memoize=True, epsilon=e).protect(features, Public(), protection.generator(key.read_bytes()))
+        LDP(dictionary=small, memoize=True, epsilon=e).protect(features, Public(), protection.create_generator(key.read_bytes()))
         for e in (4.0, 4.01)
     ]
     told = [(words(release) == nearest[:, None]).any(axis=1) for release in alike]
@@ -97,17 +97,17 @@ def test_another_configuration_is_another_table(small: Asset, tmp_path: Path) ->
 
 def test_the_key_is_made_once_for_its_owner(small: Asset, tmp_path: Path) -> None:
     defense, key = LDP(dictionary=small, memoize=True), tmp_path / "key"
-    bench.protect(example_features(), defense, device=key)
+    bench.protect(draw_features(), defense, device=key)
     kept = key.read_bytes()
     assert len(kept) == 32
     assert len(set(kept)) > 8
     assert stat.S_IMODE(os.stat(key).st_mode) == 0o600
-    bench.protect(example_features(), defense, device=str(key))
+    bench.protect(draw_features(), defense, device=str(key))
     assert key.read_bytes() == kept
 
 
 def test_mistakes(small: Asset, tmp_path: Path) -> None:
-    features, remembering = example_features(), LDP(dictionary=small, memoize=True)
+    features, remembering = draw_features(), LDP(dictionary=small, memoize=True)
     with pytest.raises(UserError, match=r"ldp, as configured, needs the file of the device's key: protect\(..., device=PATH\)"):
         bench.protect(features, remembering)
     with pytest.raises(UserError, match="ldp, as configured, does not remember"):

@@ -12,8 +12,16 @@ from scipy import stats
 
 from bench import cli
 from bench.core.errors import UserError
-from bench.mechanisms.subset import most_informative_size, word_subsets
-from bench.mechanisms.subset_size import SAMPLE, Service, choices, drawn, kept, measured, success
+from bench.mechanisms.subset import draw_word_subsets, most_informative_size
+from bench.mechanisms.subset_size import (
+    SAMPLE,
+    Workload,
+    collect_recalls,
+    compute_sample_chance,
+    compute_selection_chance,
+    estimate_sizes,
+    success,
+)
 
 
 def test_matches_against_enumeration() -> None:
@@ -25,8 +33,8 @@ def test_matches_against_enumeration() -> None:
         chance = domain * (math.exp(epsilon) if 0 in Z else 1.0) / total / math.comb(domain, size)  # word 0 is the true one
         right += chance * (0 in Z)
         wrong += chance * points * len(Z) / domain  # a point with any word alike is met so often
-    (found,) = choices(epsilon, domain, [size], Service(keypoints=1, repeated=[1.0], points=points))
-    assert found.right == pytest.approx(right, rel=1e-12) == pytest.approx(found.told, rel=1e-12)
+    (found,) = estimate_sizes(epsilon, domain, [size], Workload(keypoints=1, repeatability=[1.0], points=points))
+    assert found.right == pytest.approx(right, rel=1e-12) == pytest.approx(found.inclusion, rel=1e-12)
     assert found.wrong == pytest.approx(wrong, rel=1e-12)
 
 
@@ -42,7 +50,7 @@ def test_information_is_that_of_the_enumeration() -> None:
                 relative = domain * (math.exp(epsilon) if v in Z else 1.0) / total  # Pr(Z | v) / Pr(Z)
                 bits += relative * math.log2(relative) / domain / math.comb(domain, size)
         told.append(bits)
-    found = choices(epsilon, domain, range(1, domain), Service())
+    found = estimate_sizes(epsilon, domain, range(1, domain), Workload())
     assert [row.bits for row in found] == pytest.approx(told, rel=1e-9)
     assert max(found, key=lambda row: row.bits).size == most_informative_size(epsilon, domain)
 
@@ -52,10 +60,10 @@ def test_samples_against_enumeration() -> None:
         samples = list(combinations(range(right + wrong), SAMPLE))
         share = np.mean([max(sample) < right for sample in samples])  # matches are numbered, the right ones first
         expected = 1 - (1 - share) ** 7
-        assert drawn(np.array([right]), wrong, 7)[0] == pytest.approx(expected, abs=1e-12)
+        assert compute_sample_chance(np.array([right]), wrong, 7)[0] == pytest.approx(expected, abs=1e-12)
 
 
-def simulated(n: int, told: float, wrong: int, trials: int, agreeing: float, runs: int = 4000) -> float:
+def simulate_success(n: int, told: float, wrong: int, trials: int, agreeing: float, runs: int = 4000) -> float:
     """RANSAC on matches that are right or wrong, trial by trial."""
     rng = np.random.default_rng([n, wrong, trials])
     found = 0
@@ -75,38 +83,38 @@ def simulated(n: int, told: float, wrong: int, trials: int, agreeing: float, run
 def test_success_against_simulation(n: int, told: float, wrong: int, trials: int, agreeing: float) -> None:
     runs = 1500
     expected = success(n, told, wrong, trials, agreeing)
-    share = simulated(n, told, wrong, trials, agreeing, runs)
+    share = simulate_success(n, told, wrong, trials, agreeing, runs)
     assert 0.05 < expected < 0.95
     assert stats.binomtest(round(share * runs), runs, expected).pvalue > 1e-3
 
 
 def test_control_half_of_the_model_fails() -> None:
     n, told, wrong, trials, agreeing, runs = 20, 0.5, 30, 25, 0.1, 1500
-    hits = round(simulated(n, told, wrong, trials, agreeing, runs) * runs)
+    hits = round(simulate_success(n, told, wrong, trials, agreeing, runs) * runs)
     assert stats.binomtest(hits, runs, success(n, told, wrong, trials, agreeing)).pvalue > 1e-3
     right = np.arange(n + 1)
-    for half in (drawn(right, wrong, trials), kept(right, wrong, trials, agreeing)):
+    for half in (compute_sample_chance(right, wrong, trials), compute_selection_chance(right, wrong, trials, agreeing)):
         assert stats.binomtest(hits, runs, float(stats.binom.pmf(right, n, told) @ half)).pvalue < 1e-9
 
 
 def test_told_words_are_those_of_the_mechanism() -> None:
     rng = np.random.default_rng(0)
     true = rng.integers(500, size=50_000)
-    for row in choices(3.0, 500, [1, 3, 20], Service()):
-        share = (word_subsets(true, 500, 3.0, row.size, rng) == true[:, None]).any(axis=1).mean()
-        assert row.told == pytest.approx(share, abs=0.01)
+    for row in estimate_sizes(3.0, 500, [1, 3, 20], Workload()):
+        share = (draw_word_subsets(true, 500, 3.0, row.size, rng) == true[:, None]).any(axis=1).mean()
+        assert row.inclusion == pytest.approx(share, abs=0.01)
 
 
 def test_criteria_part() -> None:
     """At the scaled size of the paper, one criterion asks for few words, the other for many."""
-    rows = choices(6.534, 8000, [1, 2, 4, 8, 16, 65], Service())
+    rows = estimate_sizes(6.534, 8000, [1, 2, 4, 8, 16, 65], Workload())
     assert max(rows, key=lambda row: row.bits).size == 65
     assert max(rows, key=lambda row: row.success).size <= 2
     # With few keypoints, one word each leaves too few right matches to be told from chance.
-    few = choices(6.534, 8000, [1, 2, 4, 8, 16], Service(keypoints=150))
+    few = estimate_sizes(6.534, 8000, [1, 2, 4, 8, 16], Workload(keypoints=150))
     assert max(few, key=lambda row: row.success).size > 2
-    several = choices(6.534, 8000, [2], Service(repeated=[0.1, 0.5]))[0]
-    each = [choices(6.534, 8000, [2], Service(repeated=[share]))[0].success for share in (0.1, 0.5)]
+    several = estimate_sizes(6.534, 8000, [2], Workload(repeatability=[0.1, 0.5]))[0]
+    each = [estimate_sizes(6.534, 8000, [2], Workload(repeatability=[share]))[0].success for share in (0.1, 0.5)]
     assert several.success == pytest.approx(np.mean(each))
 
 
@@ -121,9 +129,9 @@ def test_criteria_part() -> None:
 )
 def test_mistakes(given: Any, complaint: str) -> None:
     with pytest.raises(UserError, match=complaint):
-        choices(*given, Service())
+        estimate_sizes(*given, Workload())
     with pytest.raises(UserError, match="shares are from 0 to 1"):
-        choices(1.0, 10, [1], Service(repeated=[2.0]))
+        estimate_sizes(1.0, 10, [1], Workload(repeatability=[2.0]))
 
 
 def record(size: int, epsilon: float | str, **changed: Any) -> dict[str, Any]:
@@ -140,9 +148,9 @@ def record(size: int, epsilon: float | str, **changed: Any) -> dict[str, Any]:
 def test_what_was_measured() -> None:
     records = [record(1, 2.0), record(2, 2.0004), record(2, 2.0), record(1, "inf"), record(2, "inf"), record(4, 3.0)]
     records += [record(2, 2.0, condition="night"), record(2, 2.0, status="failed"), record(2, 2.0, task_settings={"trials": 5})]
-    assert measured(records, 2.0, 100, 30_000, "day") == ({1: [0.0], 2: [1.0, 1.0]}, [0.25])
+    assert collect_recalls(records, 2.0, 100, 30_000, "day") == ({1: [0.0], 2: [1.0, 1.0]}, [0.25])
     with pytest.raises(UserError, match="no localization with ldp:epsilon=2 or inf, words=99"):
-        measured(records, 2.0, 99, 30_000, "day")
+        collect_recalls(records, 2.0, 99, 30_000, "day")
 
 
 def run(capfd: pytest.CaptureFixture[str], *arguments: Any) -> tuple[int, str, str]:

@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 import torch
 from fake_plugins.painter import Painter
-from fakes import FAKES, album, install
+from fakes import FAKES, write_album, install_plugins
 
 from bench import cli, testing
 from bench.core.errors import UserError
 from bench.registry import discovery, spec
-from bench.runner import plan as runner
+from bench.runner import execute
+from bench.runner.plan import build_plan
 from defenses.none import Undefended
 
 pytest.importorskip("lpips", reason="the library is not installed (pip install -e '.[lpips]')")
@@ -76,8 +77,8 @@ def test_it_keeps_the_contract_of_metrics(weights: Path) -> None:
 
 
 def test_its_settings_are_the_weights_by_content(weights: Path, tmp_path: Path) -> None:
-    album(tmp_path / "album", 1)
-    plan = runner.planned(
+    write_album(tmp_path / "album", 1)
+    plan = build_plan(
         runner.RunConfiguration(
             pairs=((Undefended(), Painter()),),
             images=tmp_path / "album",
@@ -109,8 +110,8 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
 def test_it_is_measured_where_it_is_asked_for(
     weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    install(tmp_path / "installed", monkeypatch, FAKES)
-    album(tmp_path / "album", 1)
+    install_plugins(tmp_path / "installed", monkeypatch, FAKES)
+    write_album(tmp_path / "album", 1)
     monkeypatch.chdir(tmp_path)
     command = ["run", "--defense", "none", "--attack", "painter", "--images", "album", "--json"]
 

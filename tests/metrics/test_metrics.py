@@ -27,7 +27,7 @@ def images(request: Any) -> tuple[np.ndarray, np.ndarray]:
     return truth.astype(np.float32), estimate.astype(np.float32)
 
 
-def unit(rows: np.ndarray) -> np.ndarray:
+def normalize_rows(rows: np.ndarray) -> np.ndarray:
     return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
 
 
@@ -135,7 +135,7 @@ def test_l2_is_the_mean_of_distances() -> None:
 
 def test_recovered_counts_those_nearest_to_their_own() -> None:
     truth = np.eye(4, dtype=np.float32)
-    estimate = unit(np.array([[0.6, 0.5, 0, 0], [0.6, 0.5, 0, 0], [0, 0, 1, 0], [0, 0, 0, -1]]))
+    estimate = normalize_rows(np.array([[0.6, 0.5, 0, 0], [0.6, 0.5, 0, 0], [0, 0, 1, 0], [0, 0, 0, -1]]))
     # 0 and 2 are nearest to their own; 1 is nearest to 0; 3 ties with cosine 0 between 0, 1 and 2.
     assert recovered.PLUGIN()(truth, estimate) == 0.5
     assert recovered.PLUGIN()(truth, truth) == 1.0
@@ -155,10 +155,10 @@ def test_recovered_takes_equal_descriptors_for_one_candidate() -> None:
 def test_recovered_chance_level() -> None:
     """Any one guess for all gives exactly 1 / N; independent guesses give it on average."""
     rng = np.random.default_rng(0)
-    truth = unit(rng.normal(size=(200, 16)))
-    same = np.repeat(unit(rng.normal(size=(1, 16))), 200, axis=0)
+    truth = normalize_rows(rng.normal(size=(200, 16)))
+    same = np.repeat(normalize_rows(rng.normal(size=(1, 16))), 200, axis=0)
     assert recovered.PLUGIN()(truth, same) == pytest.approx(1 / 200)
-    hits = sum(round(200 * recovered.PLUGIN()(truth, unit(rng.normal(size=(200, 16))))) for _ in range(50))
+    hits = sum(round(200 * recovered.PLUGIN()(truth, normalize_rows(rng.normal(size=(200, 16))))) for _ in range(50))
     assert 20 <= hits <= 85  # 50 are expected; about Poisson, so within 5 deviations
 
 
@@ -171,7 +171,7 @@ def test_recovered_chance_level() -> None:
 @pytest.fixture(scope="module")
 def portrait() -> np.ndarray:
     """The astronaut, whose face the detector finds. (256, 256, 3) float32 in [0, 1]"""
-    (astronaut, *_) = photographs.of_people()
+    (astronaut, *_) = photographs.list_people()
     return (photographs.read(astronaut.path).pixels / 255).astype(np.float32)
 
 
@@ -187,7 +187,7 @@ def test_a_face_is_found_again_only_where_it_was(portrait: np.ndarray) -> None:
 
 
 def test_a_photograph_without_a_face_has_no_share(portrait: np.ndarray) -> None:
-    for source in photographs.of_grounds():
+    for source in photographs.list_ground_textures():
         ground = (photographs.read(source.path).pixels / 255).astype(np.float32)
         assert face.PLUGIN()(ground, portrait) is None
 
@@ -224,7 +224,7 @@ def test_overlap_is_the_share_of_pixels_counted_one_by_one() -> None:
         return {(row, column) for row in range(top, top + height) for column in range(left, left + width)}
 
     expected = [len(pixels(a) & pixels(b)) / len(pixels(a) | pixels(b)) for a, b in zip(one, other, strict=True)]
-    np.testing.assert_allclose(face.overlap(one.astype(float), other.astype(float)), expected)
+    np.testing.assert_allclose(face.compute_overlap(one.astype(float), other.astype(float)), expected)
     assert min(expected) == 0.0 < max(expected)
 
 
@@ -245,7 +245,7 @@ def test_values_are_in_range_and_pure(plugin: type[Metric]) -> None:
     for _ in range(10):
         truth, estimate = rng.random(shape).astype(np.float32), rng.random(shape).astype(np.float32)
         if plugin in DESCRIPTORS:
-            truth, estimate = unit(truth - 0.5), unit(estimate - 0.5)
+            truth, estimate = normalize_rows(truth - 0.5), normalize_rows(estimate - 0.5)
         before = truth.copy(), estimate.copy()
         value = plugin()(truth, estimate)
         assert value is None if plugin is face.PLUGIN else isinstance(value, float)  # noise has no face

@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fakes import texture
+from fakes import draw_texture
 
 from bench.api import Attack, Defense, Extractor, Metric, Privacy, View
 from bench.cache import store
 from bench.codebook import dictionary
-from bench.codebook.examples import example_features, small_dictionary
+from bench.codebook.examples import draw_features, write_dictionary
 from bench.codebook.public import Public
 from bench.extractors.sift import Sift
 from bench.formats import tensor_file
@@ -20,16 +20,16 @@ from bench.images import photographs
 from bench.registry import discovery, fields, spec
 from bench.registry.discovery import Kind
 from bench.testing import check_applicability, check_attack, check_defense, check_extractor, check_metric
-from bench.types import Descriptors, Features
+from bench.types import Descriptors, Features, Points
 from defenses.ldp import LDP
 
 
 def plugins(kind: Kind) -> Any:
-    return pytest.mark.parametrize("plugin", discovery.everything(kind), ids=lambda plugin: plugin.name())
+    return pytest.mark.parametrize("plugin", discovery.load_plugins(kind), ids=lambda plugin: plugin.name())
 
 
 def built(plugin: type) -> Any:
-    if fields.without_default(plugin):
+    if fields.list_required(plugin):
         pytest.skip("has a field that must be given, and a test of its own")
     return spec.build(plugin, {})
 
@@ -37,10 +37,8 @@ def built(plugin: type) -> Any:
 @plugins(discovery.DEFENSE)
 def test_defense(plugin: type[Defense], tmp_path: Path) -> None:
     defense = built(plugin)
-    small = small_dictionary(tmp_path)
-    check_defense(
-        dataclasses.replace(defense, **dict.fromkeys(fields.asset_fields(defense), small)), Public(), example_features()
-    )
+    small = write_dictionary(tmp_path)
+    check_defense(dataclasses.replace(defense, **dict.fromkeys(fields.list_assets(defense), small)), Public(), draw_features())
 
 
 @plugins(discovery.METRIC)
@@ -50,23 +48,23 @@ def test_metric(plugin: type[Metric]) -> None:
 
 @plugins(discovery.EXTRACTOR)
 def test_extractor(plugin: type[Extractor], tmp_path: Path) -> None:
-    check_extractor(built(plugin), photographs.square(texture(0), 256))
+    check_extractor(built(plugin), photographs.crop_square(draw_texture(0), 256))
 
 
 PAIRS = [
     pytest.param(attack, defense, id=f"{attack.name()}-{defense.name()}")
-    for attack in discovery.everything(discovery.ATTACK)
-    for defense in discovery.everything(discovery.DEFENSE)
+    for attack in discovery.load_plugins(discovery.ATTACK)
+    for defense in discovery.load_plugins(discovery.DEFENSE)
 ]
 
 
 @pytest.mark.parametrize(("attack", "defense"), PAIRS)
 def test_attack(attack: type[Attack], defense: type[Defense], tmp_path: Path) -> None:
     attacker, defender = built(attack), built(defense)
-    if "database" in fields.asset_fields(attacker):
-        attacker = dataclasses.replace(attacker, database=small_dictionary(tmp_path))
+    if "database" in fields.list_assets(attacker):
+        attacker = dataclasses.replace(attacker, database=write_dictionary(tmp_path))
     if check_applicability(attacker, defender, Sift(), Public()):
-        check_attack(attacker, defender, Sift(), example_features(20))
+        check_attack(attacker, defender, Sift(), draw_features(20))
 
 
 # ---- negative controls: each breaks one promise, and its check notices
@@ -77,7 +75,7 @@ class Leaky(Defense):
     releases = Descriptors
 
     def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> Descriptors:
-        return Descriptors(keypoints=secret.keypoints.copy(), size=secret.size, descriptors=secret.descriptors)
+        return Descriptors(positions=Points(keypoints=secret.keypoints.copy()), size=secret.size, descriptors=secret.descriptors)
 
     def privacy(self, public: Public) -> Privacy:
         return Privacy("none")
@@ -86,14 +84,18 @@ class Leaky(Defense):
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Shifted(Leaky):
     def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> Descriptors:
-        return Descriptors(keypoints=secret.keypoints + 1, size=secret.size, descriptors=secret.descriptors.copy())
+        return Descriptors(
+            positions=Points(keypoints=secret.keypoints + 1), size=secret.size, descriptors=secret.descriptors.copy()
+        )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Careless(Leaky):
     def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> Descriptors:
         order = np.random.default_rng().permutation(len(secret))  # its own randomness
-        return Descriptors(keypoints=secret.keypoints.copy(), size=secret.size, descriptors=secret.descriptors[order])
+        return Descriptors(
+            positions=Points(keypoints=secret.keypoints.copy()), size=secret.size, descriptors=secret.descriptors[order]
+        )
 
 
 @pytest.mark.parametrize(
@@ -101,7 +103,7 @@ class Careless(Leaky):
 )
 def test_wrong_defense_is_noticed(defense: Defense, complaint: str) -> None:
     with pytest.raises(AssertionError, match=complaint):
-        check_defense(defense, Public(), example_features())
+        check_defense(defense, Public(), draw_features())
 
 
 def test_an_extractor_that_keeps_the_order_of_responses_is_noticed() -> None:
@@ -113,7 +115,7 @@ def test_an_extractor_that_keeps_the_order_of_responses_is_noticed() -> None:
             )
 
     with pytest.raises(AssertionError, match="order of keypoints"):
-        check_extractor(Ranked(), photographs.square(texture(0), 256))
+        check_extractor(Ranked(), photographs.crop_square(draw_texture(0), 256))
 
 
 def test_peeking_attack_is_noticed() -> None:
@@ -127,7 +129,7 @@ def test_peeking_attack_is_noticed() -> None:
             return view.release.descriptors
 
     with pytest.raises(AssertionError, match="saw more"):
-        check_attack(Peeking(), Leaky(), Sift(), example_features())
+        check_attack(Peeking(), Leaky(), Sift(), draw_features())
 
 
 def test_attack_that_rummages_in_what_is_kept_on_disk_is_noticed(tmp_path: Path) -> None:
@@ -135,16 +137,16 @@ def test_attack_that_rummages_in_what_is_kept_on_disk_is_noticed(tmp_path: Path)
 
     class Rummaging(Guess):
         def recover(self, view: View, rng: np.random.Generator) -> np.ndarray:
-            (features,) = (entry.path for entry in store.entries() if entry.kind == "features")
+            (features,) = (entry.path for entry in store.list_entries() if entry.kind == "features")
             return unit_rows(tensor_file.load(features, "features")[0]["descriptors"] + np.float32(1e-3))
 
     class Quantised(Guess):
         def recover(self, view: View, rng: np.random.Generator) -> np.ndarray:
-            (words,) = (entry.path for entry in store.entries() if entry.kind == "words")
+            (words,) = (entry.path for entry in store.list_entries() if entry.kind == "words")
             found = tensor_file.load(words, "words")[0]["words"]
             return unit_rows(dictionary.load(Path(small)).words[found])
 
-    small = small_dictionary(tmp_path)
+    small = write_dictionary(tmp_path)
     for attack in (Rummaging(), Quantised()):
         with pytest.raises(AssertionError, match="saw more"):
-            check_attack(attack, LDP(dictionary=small), Sift(), example_features())
+            check_attack(attack, LDP(dictionary=small), Sift(), draw_features())

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fakes import FAKES, install
+from fakes import FAKES, install_plugins
 
 from bench.api import Attack, Defense, Metric, Privacy
 from bench.codebook.public import Public
@@ -31,33 +31,33 @@ def test_modules_without_plugin_and_subpackages_are_skipped() -> None:
 
 
 def test_external_plugins_are_found_by_entry_point(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    install(tmp_path, monkeypatch, FAKES)
-    assert discovery.lookup(discovery.ATTACK, "painter").name() == "painter"
-    assert discovery.lookup(discovery.DEFENSE, "broken").summary() == "Fails at every photograph."
+    install_plugins(tmp_path, monkeypatch, FAKES)
+    assert discovery.load_plugin(discovery.ATTACK, "painter").name() == "painter"
+    assert discovery.load_plugin(discovery.DEFENSE, "broken").summary() == "Fails at every photograph."
 
 
 def test_two_plugins_of_one_name_are_refused_with_both_origins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    install(tmp_path, monkeypatch, {"feature_privacy.defenses": {"ldp": "fake_plugins.broken:PLUGIN"}}, name="stranger")
+    install_plugins(tmp_path, monkeypatch, {"feature_privacy.defenses": {"ldp": "fake_plugins.broken:PLUGIN"}}, name="stranger")
     with pytest.raises(UserError, match=r"two defense plugins are called 'ldp': defenses\.ldp and fake_plugins.*stranger"):
-        discovery.lookup(discovery.DEFENSE, "none")
+        discovery.load_plugin(discovery.DEFENSE, "none")
 
 
 def test_entry_point_must_have_the_name_of_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    install(tmp_path, monkeypatch, {"feature_privacy.defenses": {"other": "fake_plugins.broken:PLUGIN"}})
+    install_plugins(tmp_path, monkeypatch, {"feature_privacy.defenses": {"other": "fake_plugins.broken:PLUGIN"}})
     with pytest.raises(UserError, match=r"'other'.*'broken'"):
-        discovery.lookup(discovery.DEFENSE, "other")
+        discovery.load_plugin(discovery.DEFENSE, "other")
 
 
 def test_plugin_that_cannot_be_imported_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    install(tmp_path, monkeypatch, {"feature_privacy.defenses": {"absent": "no_such_module:PLUGIN"}}, name="stranger")
-    assert discovery.lookup(discovery.DEFENSE, "none")  # the others are not affected
+    install_plugins(tmp_path, monkeypatch, {"feature_privacy.defenses": {"absent": "no_such_module:PLUGIN"}}, name="stranger")
+    assert discovery.load_plugin(discovery.DEFENSE, "none")  # the others are not affected
     with pytest.raises(UserError, match=r"no_such_module.*stranger.*cannot be imported"):
-        discovery.lookup(discovery.DEFENSE, "absent")
+        discovery.load_plugin(discovery.DEFENSE, "absent")
 
 
 def test_misspelt_name_gets_a_hint_and_the_list() -> None:
     with pytest.raises(UserError, match=r"unknown defense 'lpd'; did you mean 'ldp'\?.*affine.*none"):
-        discovery.lookup(discovery.DEFENSE, "lpd")
+        discovery.load_plugin(discovery.DEFENSE, "lpd")
 
 
 def frozen(base: type, **body: Any) -> type:

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from bench.api import Asset
-from bench.codebook.examples import small_dictionary
+from bench.codebook.examples import write_dictionary
 from bench.codebook.public import Public
 from bench.core.errors import UserError
 from bench.extractors.sift import Sift
 from bench.registry import discovery, spec
+from bench.settings import Asset
 from defenses.affine import Affine
 from defenses.ldp import LDP
 
@@ -42,7 +42,7 @@ def test_infinity_truth_choices_and_paths() -> None:
         ("lpd", "did you mean 'ldp'"),
         (
             "ldp:epsilom=1",
-            r"unknown field of ldp 'epsilom'; did you mean 'epsilon'\? There is dictionary, epsilon, memoize, subset_size",
+            r"unknown field of ldp 'epsilom'; did you mean 'epsilon'\? Available: dictionary, epsilon, memoize, subset_size",
         ),
         ("ldp:epsilon=much", "epsilon must be a number"),
         ("ldp:epsilon=nan", "epsilon must be a number"),
@@ -75,8 +75,8 @@ def test_field_without_default_must_be_given() -> None:
 
 
 def test_configuration_holds_the_content_of_files(tmp_path: Path) -> None:
-    public, small = Public(), small_dictionary(tmp_path)
-    assert spec.configuration(LDP(epsilon=10, dictionary=small), public) == {
+    public, small = Public(), write_dictionary(tmp_path)
+    assert spec.to_json_with_digests(LDP(epsilon=10, dictionary=small), public) == {
         "name": "ldp",
         "epsilon": 10.0,
         "subset_size": 2,
@@ -85,26 +85,28 @@ def test_configuration_holds_the_content_of_files(tmp_path: Path) -> None:
         "memoize": False,
     }
     renamed = Asset(Path(small).rename(tmp_path / "renamed.safetensors"))
-    assert spec.configuration(LDP(dictionary=renamed), public) == spec.configuration(LDP(epsilon=10, dictionary=small), public)
+    assert spec.to_json_with_digests(LDP(dictionary=renamed), public) == spec.to_json_with_digests(
+        LDP(epsilon=10, dictionary=small), public
+    )
 
 
 def test_configuration_knows_no_infinity_and_one_way_of_writing_a_number(tmp_path: Path) -> None:
-    small = small_dictionary(tmp_path)
-    assert spec.configuration(LDP(epsilon=math.inf, dictionary=small), Public())["epsilon"] == "inf"
-    assert repr(spec.written(LDP(epsilon=10))["epsilon"]) == "10.0"
+    small = write_dictionary(tmp_path)
+    assert spec.to_json_with_digests(LDP(epsilon=math.inf, dictionary=small), Public())["epsilon"] == "inf"
+    assert repr(spec.to_json(LDP(epsilon=10))["epsilon"]) == "10.0"
 
 
 @pytest.mark.parametrize(("text", "written"), [("21/2", 10.5), ("0.1", 0.1), ("1/3", "1/3"), ("10", 10.0), ("inf", "inf")])
 def test_a_fraction_is_kept(text: str, written: float | str) -> None:
     """And written so that two configurations which differ are two in the records, too."""
-    assert spec.written(spec.read(f"ldp:epsilon={text}", discovery.DEFENSE))["epsilon"] == written
-    assert spec.written(spec.read("ldp:epsilon=0.3333333333333333", discovery.DEFENSE))["epsilon"] != "1/3"
+    assert spec.to_json(spec.read(f"ldp:epsilon={text}", discovery.DEFENSE))["epsilon"] == written
+    assert spec.to_json(spec.read("ldp:epsilon=0.3333333333333333", discovery.DEFENSE))["epsilon"] != "1/3"
 
 
 def test_what_is_resolved_elsewhere_stands_in_the_place_of_an_asset() -> None:
     from attacks.nearest import Nearest
 
-    assert spec.configuration(Nearest(), Public(), {"database": "sha256:00", "inversion": None}) == {
+    assert spec.to_json_with_digests(Nearest(), Public(), {"database": "sha256:00", "inversion": None}) == {
         "name": "nearest",
         "database": "sha256:00",
         "inversion": None,

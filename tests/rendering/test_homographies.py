@@ -6,11 +6,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from fakes import texture
+from fakes import draw_texture
 
 from bench.core.errors import UserError
 from bench.rendering import homographies
-from bench.rendering.homographies import SIDE, hpatches, made
+from bench.rendering.homographies import SIDE, load_hpatches, create_pairs
 
 SHIFT = np.array([[1, 0, 3.0], [0, 1, -2.0], [0, 0, 1]])
 
@@ -21,7 +21,7 @@ def folder(tmp_path: Path) -> Path:
     for sequence in ("i_wall", "v_roof"):
         (tmp_path / sequence).mkdir()
         for number in range(1, 7):
-            texture(number).save(tmp_path / sequence / f"{number}.ppm")
+            draw_texture(number).save(tmp_path / sequence / f"{number}.ppm")
         for number in range(2, 7):
             np.savetxt(tmp_path / sequence / f"H_1_{number}", SHIFT @ np.diag([0.5, 0.5, 1.0]))
     (tmp_path / "README").write_text("not a sequence")
@@ -29,15 +29,15 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_hpatches_is_read(folder: Path) -> None:
-    pairs = hpatches(folder)
+    pairs = load_hpatches(folder)
     assert [pair.name for pair in pairs] == [f"{name}-{number}" for name in ("i_wall", "v_roof") for number in range(2, 7)]
-    np.testing.assert_array_equal(pairs[0].first.read(), np.asarray(texture(1)))
-    np.testing.assert_array_equal(pairs[6].second.read(), np.asarray(texture(3)))
+    np.testing.assert_array_equal(pairs[0].first.read(), np.asarray(draw_texture(1)))
+    np.testing.assert_array_equal(pairs[6].second.read(), np.asarray(draw_texture(3)))
 
 
 def test_homographies_of_hpatches_are_moved_by_half_a_pixel(folder: Path) -> None:
     # There the first pixel's centre is (0, 0), which goes to (3, -2); here that is (0.5, 0.5) to (3.5, -1.5).
-    found = hpatches(folder)[0].homography @ [0.5, 0.5, 1]
+    found = load_hpatches(folder)[0].homography @ [0.5, 0.5, 1]
     np.testing.assert_allclose(found, [3.5, -1.5, 1])
     assert not np.allclose(SHIFT @ np.diag([0.5, 0.5, 1]) @ [0.5, 0.5, 1], [3.5, -1.5, 1])  # a matrix as stored fails
 
@@ -58,19 +58,19 @@ def test_homographies_of_hpatches_are_moved_by_half_a_pixel(folder: Path) -> Non
 def test_damaged_sequences_are_refused(folder: Path, damage: Callable[[Path], object], complaint: str) -> None:
     damage(folder / "v_roof" / "H_1_3")
     with pytest.raises(UserError, match=complaint):
-        hpatches(folder)
+        load_hpatches(folder)
 
 
 def test_folders_without_sequences_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="no such folder"):
-        hpatches(tmp_path / "absent")
+        load_hpatches(tmp_path / "absent")
     with pytest.raises(UserError, match="no sequence of HPatches"):
-        hpatches(tmp_path)
+        load_hpatches(tmp_path)
 
 
 def test_made_pairs_are_seen_where_their_homography_says() -> None:
     """OpenCV's own alignment starts from the stated homography and finds nothing to improve; from another it does."""
-    pairs = made(0, 2)
+    pairs = create_pairs(0, 2)
     assert len({pair.name for pair in pairs}) == len(pairs) == 14
     for pair in pairs[:4]:
         first, second = (cv2.cvtColor(image.read(), cv2.COLOR_RGB2GRAY) for image in (pair.first, pair.second))
@@ -92,7 +92,7 @@ def drift(first: np.ndarray, second: np.ndarray, homography: np.ndarray) -> floa
 
 
 def test_made_pairs_follow_their_seed() -> None:
-    one, same, other = made(3, 1)[0], made(3, 1)[0], made(4, 1)[0]
+    one, same, other = create_pairs(3, 1)[0], create_pairs(3, 1)[0], create_pairs(4, 1)[0]
     np.testing.assert_array_equal(one.second.read(), same.second.read())
     assert one.second.content_hash() == same.second.content_hash() != one.first.content_hash()
     assert not np.allclose(one.homography, other.homography)

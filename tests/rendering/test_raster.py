@@ -9,17 +9,17 @@ from scipy.ndimage import center_of_mass, label
 from scipy.spatial.transform import Rotation
 
 from bench.rendering.mipmap import Texture
-from bench.rendering.raster import Drawing, Eye, Quad, draw
+from bench.rendering.raster import Drawing, PinholeCamera, Quad, draw
 
 SIZE = 160, 120
 FOCAL = 140.0
 WHITE = np.ones((1, 1, 3), np.float32)
 
 
-def eye(rotation: np.ndarray | None = None, centre: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Eye:
+def eye(rotation: np.ndarray | None = None, centre: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> PinholeCamera:
     turned = np.eye(3) if rotation is None else rotation
     calibration = np.array([[FOCAL, 0, SIZE[0] / 2], [0, FOCAL, SIZE[1] / 2], [0, 0, 1]])
-    return Eye(calibration=calibration, rotation=turned, translation=-turned @ np.array(centre), size=SIZE)
+    return PinholeCamera(calibration=calibration, rotation=turned, translation=-turned @ np.array(centre), size=SIZE)
 
 
 def quad(pixels: np.ndarray, corner=(-1.0, -1.0, 3.0), across=(2.0, 0.0, 0.0), down=(0.0, 2.0, 0.0), **rest) -> Quad:
@@ -36,7 +36,7 @@ def black(rays: np.ndarray) -> np.ndarray:
     return np.zeros_like(rays)
 
 
-def picture(where: Eye, *quads: Quad, foreground: tuple[Quad, ...] = ()) -> Drawing:
+def picture(where: PinholeCamera, *quads: Quad, foreground: tuple[Quad, ...] = ()) -> Drawing:
     return draw(where, quads, foreground, black)
 
 

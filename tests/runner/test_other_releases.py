@@ -4,28 +4,28 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fakes import album
+from fakes import write_album
 
 from bench.codebook.public import Public
 from bench.core import randomness as seeds
 from bench.extractors.sift import Sift
 from bench.geometry.nearest_words import unit_rows
-from bench.images.photographs import Source, folder
-from bench.runner.other_releases import OtherReleases, random_window
+from bench.images.photographs import Source, list_photographs
+from bench.runner.other_releases import ReleasePool, random_window
 from defenses.none import Undefended
 
 
 def randomness(*parts: object) -> np.random.Generator:
-    return seeds.randomness("test", *parts)
+    return seeds.derive_generator("test", *parts)
 
 
 @pytest.fixture
 def sources(tmp_path: Path) -> list[Source]:
-    return folder(album(tmp_path / "album", 3))
+    return list_photographs(write_album(tmp_path / "album", 3))
 
 
-def population(sources: list[Source]) -> OtherReleases:
-    return OtherReleases(sources, Sift(), Undefended(), Public(), randomness)
+def population(sources: list[Source]) -> ReleasePool:
+    return ReleasePool(sources, Sift(), Undefended(), Public(), randomness)
 
 
 def similarity(release, source: Source) -> float:

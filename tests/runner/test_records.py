@@ -14,8 +14,13 @@ from bench.runner import records
 from bench.runner.records import Log, read
 
 
-def record(unit: str, **more: Any) -> dict[str, Any]:
-    return {"schema": 1, "run_hash": "r", "cell_id": "c", "unit": unit, "status": "ok", "metrics": {"ssim": 0.1 + 0.2}, **more}
+SCHEMA_1 = Path(__file__).resolve().parents[1] / "data" / "records-schema-1.jsonl"  # written by version 0.1
+
+
+def record(sample: str, **more: Any) -> dict[str, Any]:
+    metrics = {"ssim": 0.1 + 0.2}
+    entries = {"schema": 2, "run_hash": "r", "experiment_id": "c", "sample": sample, "status": "ok", "metrics": metrics, **more}
+    return records.seal(entries)
 
 
 def write(path: Path, *found: dict[str, Any]) -> Path:
@@ -41,7 +46,7 @@ def test_records_are_on_file_as_soon_as_they_are_appended(tmp_path: Path) -> Non
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_no_record_holds_nan_or_infinity(tmp_path: Path, value: float) -> None:
     with Log(tmp_path / "r") as log, pytest.raises(ValueError, match="JSON compliant"):
-        log.append(record("a", seconds=value))
+        log.append(record("a") | {"seconds": value})
     assert (tmp_path / "r").read_bytes() == b""
 
 
@@ -49,10 +54,10 @@ def test_no_record_holds_nan_or_infinity(tmp_path: Path, value: float) -> None:
 def test_line_that_a_crash_cut_off_is_dropped_and_mended(tmp_path: Path, cut: int) -> None:
     path = write(tmp_path / "r", record("a"), record("b"))
     path.write_bytes(path.read_bytes()[:-cut])
-    assert [one["unit"] for one in read(path).records] == ["a"]
+    assert [one["sample"] for one in read(path).records] == ["a"]
     assert "cut off" in (read(path).notice or "")
     write(path, record("c"))
-    assert [one["unit"] for one in read(path).records] == ["a", "c"]
+    assert [one["sample"] for one in read(path).records] == ["a", "c"]
     assert read(path).notice is None
 
 
@@ -66,6 +71,51 @@ def test_other_corrupt_lines_are_named(tmp_path: Path, line: bytes) -> None:
     with pytest.raises(UserError, match="line 2"):
         Log(path)
     assert path.read_bytes() == before
+
+
+def test_every_flipped_bit_is_found(tmp_path: Path) -> None:
+    path = write(tmp_path / "r", record("a", metrics={"ssim": 0.58, "psnr": None}))
+    whole = path.read_bytes()
+    for place in range(len(whole) - 1):  # the last byte ends the line
+        for bit in range(8):
+            flipped = bytearray(whole)
+            flipped[place] ^= 1 << bit
+            path.write_bytes(flipped)
+            if flipped[place] == ord("\n"):
+                continue  # two lines, and neither is JSON
+            with pytest.raises(UserError, match="line"):
+                read(path)
+
+
+def test_records_of_schema_1_are_read_under_their_new_names() -> None:
+    old = [json.loads(line) for line in SCHEMA_1.read_text().splitlines()]
+    new = read(SCHEMA_1).records
+    assert [one["unit"] for one in old] == [one["sample"] for one in new]
+    assert [one["metrics"] for one in old] == [one["metrics"] for one in new]
+    assert all(one["schema"] == records.SCHEMA and "unit" not in one for one in new)
+    assert [one["cell_id"] for one in old] == [one["cell_id"] for one in new]
+    assert all(records.explain_invalid(one) is None for one in new)
+    assert len({one["experiment_id"] for one in new}) == len({one["cell_id"] for one in old})
+
+
+@pytest.mark.parametrize(
+    ("old", "new"), [('"epsilon": 16.0', '"epsilon": 6.0'), ('"seed": 0', '"seed": 3'), ('"numpy": "2', '"numpy": "1')]
+)
+def test_a_changed_configuration_of_schema_1_is_found(tmp_path: Path, old: str, new: str) -> None:
+    lines = SCHEMA_1.read_text().splitlines(keepends=True)
+    number, line = next((number, line) for number, line in enumerate(lines) if old in line)
+    lines[number] = line.replace(old, new, 1)
+    (tmp_path / "r").write_text("".join(lines))
+    with pytest.raises(UserError, match=rf"line {number + 1}: (cell_id|run_hash)"):
+        read(tmp_path / "r")
+
+
+def test_a_file_of_schema_1_is_resumed(tmp_path: Path) -> None:
+    path = tmp_path / "records.jsonl"
+    path.write_bytes(SCHEMA_1.read_bytes())
+    before = len(read(path).records)
+    write(path, record("new"))
+    assert [one["sample"] for one in read(path).records[before:]] == ["new"]
 
 
 def test_file_that_cannot_be_written_is_a_mistake(tmp_path: Path) -> None:
@@ -90,9 +140,9 @@ def test_dataframe_has_flat_columns_and_the_latest_records(tmp_path: Path) -> No
     write(tmp_path / "records.jsonl", old, record("b", metrics={"psnr": None}), new)
     frame = bench.load_records(tmp_path)
     assert len(frame) == 2
-    assert list(frame.set_index("unit")["status"]) == ["ok", "ok"]
-    assert frame.set_index("unit").loc["a", "defense.epsilon"] == math.inf
-    assert frame.set_index("unit").loc["a", "metrics.ssim"] == 0.1 + 0.2
+    assert list(frame.set_index("sample")["status"]) == ["ok", "ok"]
+    assert frame.set_index("sample").loc["a", "defense.epsilon"] == math.inf
+    assert frame.set_index("sample").loc["a", "metrics.ssim"] == 0.1 + 0.2
 
 
 def test_dataframe_of_nothing(tmp_path: Path) -> None:

@@ -16,22 +16,23 @@ from fake_plugins.broken import Broken
 from fake_plugins.glimpse import Glimpse
 from fake_plugins.guess import Guess
 from fake_plugins.painter import Painter
-from fakes import FAKES, album, install
+from fakes import FAKES, install_plugins, prepare_plan, write_album
 from PIL import Image
 
 from attacks.repeat import Repeat
-from bench.api import Asset, Attack, Defense, Task, View
+from bench.api import Attack, Defense, View
 from bench.cache import store
-from bench.codebook.examples import small_dictionary
+from bench.codebook.examples import write_dictionary
 from bench.core.errors import UserError
 from bench.datasets.gallery import Gallery
 from bench.mechanisms import composition
-from bench.runner import directory, engines
-from bench.runner import plan as runner
+from bench.runner import directory, engines, execute
 from bench.runner.records import FILE, Record
-from bench.runner.trial import Trials
+from bench.runner.trial import TrialRunner
+from bench.settings import Asset
+from bench.task_api import Task
 from bench.tasks.reconstruction import Reconstruction
-from bench.types import Knowledge
+from bench.threat_model import DefenseDatabase, PublicDatabase, ServerMap
 from defenses.affine import Affine
 from defenses.ldp import LDP
 from defenses.none import Undefended
@@ -41,21 +42,21 @@ PAINT = Reconstruction(inverter="painter")
 
 @pytest.fixture(autouse=True)
 def _fakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    install(tmp_path / "installed", monkeypatch, FAKES)
+    install_plugins(tmp_path / "installed", monkeypatch, FAKES)
 
 
 @pytest.fixture
 def images(tmp_path: Path) -> Path:
-    return album(tmp_path / "album")
+    return write_album(tmp_path / "album")
 
 
 @pytest.fixture
 def small(tmp_path: Path) -> Asset:
-    return small_dictionary(tmp_path)
+    return write_dictionary(tmp_path)
 
 
 def run(defenses: list[Defense], attacks: list[Attack], images: Any, task: Task = PAINT, **more: Any) -> list[Record]:
-    return runner.run(defenses, attacks, images, task=task, **more)
+    return execute.run(defenses, attacks, images, task=task, **more)
 
 
 def written(out: Path) -> list[Record]:
@@ -69,7 +70,7 @@ def judged(records: list[Record]) -> list[Any]:
 
 def test_record_has_what_the_schema_says(images: Path, small: Asset) -> None:
     first, second = run([LDP(epsilon=8, dictionary=small)], [Painter()], images)
-    assert (first["unit"], second["unit"]) == ("0.png", "1.png")
+    assert (first["sample"], second["sample"]) == ("0.png", "1.png")
     assert first["schema"] == 1
     assert first["status"] == "ok"
     assert first["reason"] is None
@@ -92,7 +93,7 @@ def test_record_has_what_the_schema_says(images: Path, small: Asset) -> None:
         1,
     )
     assert privacy["epsilon_image"] == count * 8.0
-    assert privacy["epsilon_image_optimal"] == composition.optimal(8.0, count, privacy["delta"]) < count * 8.0
+    assert privacy["epsilon_image_optimal"] == composition.compose_optimal(8.0, count, privacy["delta"]) < count * 8.0
     assert privacy["uncovered"] == ["the keypoints' positions", "the number of keypoints"]
     assert (privacy["seeded"], privacy["private"]) == (True, False)
     assert privacy["log10_true"] < 0
@@ -127,7 +128,7 @@ def test_same_seed_gives_the_same_metrics_and_another_seed_others(images: Path, 
 
 def test_release_depends_on_neither_attack_order_nor_company(images: Path, small: Asset) -> None:
     def of(records: list[Record]) -> dict[tuple[str, str, str], Any]:
-        return {(r["defense"]["name"], r["attack"]["name"], r["unit"]): (r["cell_id"] and r["metrics"]) for r in records}
+        return {(r["defense"]["name"], r["attack"]["name"], r["sample"]): (r["experiment_id"] and r["metrics"]) for r in records}
 
     ldp, affine = LDP(dictionary=small), Affine(lifting="random")
     whole = of(run([ldp, affine], [Painter(), Guess()], images))
@@ -137,9 +138,9 @@ def test_release_depends_on_neither_attack_order_nor_company(images: Path, small
 
 
 def test_releases_that_are_done_with_are_let_go_of_at_once(images: Path, small: Asset) -> None:
-    plan = runner.prepare([LDP(dictionary=small)], [Painter()], images, task=PAINT)
-    trials, (cell,), unit = Trials(plan), plan.experiments, plan.samples[0]
-    release = weakref.ref(trials.trial(cell, unit).images[0].release)
+    plan = prepare_plan([LDP(dictionary=small)], [Painter()], images, task=PAINT)
+    trials, (cell,), unit = TrialRunner(plan), plan.experiments, plan.samples[0]
+    release = weakref.ref(trials.build_trial(cell, unit).images[0].release)
     gc.disable()
     try:
         assert release() is not None  # for the next attack on it
@@ -170,7 +171,7 @@ def test_all_attacks_see_the_same_release(images: Path, small: Asset, monkeypatc
 
 def test_view_holds_declared_knowledge_alone(images: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def nosy(self: Any, view: View, rng: np.random.Generator) -> Any:
-        view.know(Knowledge.PUBLIC_DATABASE)
+        view.know(PublicDatabase)
 
     monkeypatch.setattr(Painter, "reconstruct", nosy)
     record = run([Undefended()], [Painter()], [images / "0.png"])[0]
@@ -183,7 +184,7 @@ def test_view_holds_declared_knowledge_alone(images: Path, monkeypatch: pytest.M
 
 def test_pair_that_does_not_apply_says_why(images: Path, small: Asset) -> None:
     records = run([Undefended(), LDP(dictionary=small)], [Guess()], images)
-    assert [(record["unit"], record["status"]) for record in records] == [("*", "n/a"), ("0.png", "ok"), ("1.png", "ok")]
+    assert [(record["sample"], record["status"]) for record in records] == [("*", "n/a"), ("0.png", "ok"), ("1.png", "ok")]
     assert records[0]["reason"] == "guess attacks WordSets or Subspaces; none releases Descriptors"
     assert records[0]["metrics"] == {}
 
@@ -195,10 +196,10 @@ def test_only_inapplicable_pairs_are_a_mistake(images: Path, tmp_path: Path) -> 
 
 
 def test_attack_whose_knowledge_is_not_there_does_not_apply(images: Path, small: Asset, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Painter, "needs", frozenset({Knowledge.MAP}))
+    monkeypatch.setattr(Painter, "needs", frozenset({ServerMap}))
     with pytest.raises(UserError, match="painter needs the server's map; there is none"):
         run([LDP(dictionary=small)], [Painter()], images)
-    monkeypatch.setattr(Painter, "needs", frozenset({Knowledge.DATABASE}))
+    monkeypatch.setattr(Painter, "needs", frozenset({DefenseDatabase}))
     with pytest.raises(UserError, match="painter needs the database W"):
         run([LDP(dictionary=small)], [Painter()], images)
     assert run([Affine(database=small)], [Painter()], images)[0]["status"] == "ok"
@@ -246,8 +247,8 @@ def test_mistakes_are_found_before_anything_is_written(images: Path, tmp_path: P
     out = tmp_path / "out"
     empty = tmp_path / "empty"
     empty.mkdir()
-    tiny = small_dictionary(tmp_path, words=3)
-    broken = Path(shutil.copy(small_dictionary(tmp_path), tmp_path / "broken.safetensors"))
+    tiny = write_dictionary(tmp_path, words=3)
+    broken = Path(shutil.copy(write_dictionary(tmp_path), tmp_path / "broken.safetensors"))
     broken.write_bytes(broken.read_bytes()[:-1] + b"\x07")
     mistakes: list[tuple[Callable[[], Any], str]] = [
         (lambda: run([Undefended()], [Painter()], empty, out=out), "no photograph in it"),
@@ -302,8 +303,8 @@ def test_finished_run_is_not_done_again(images: Path, small: Asset, tmp_path: Pa
 def test_interrupted_run_goes_on_and_ends_as_if_it_had_not_been(images: Path, small: Asset, tmp_path: Path) -> None:
     grid: Any = ([LDP(dictionary=small)], [Painter(), Guess()], images)
     whole = run(*grid)
-    plan = runner.prepare(*grid, task=PAINT)
-    started: Iterator[Record] = runner.execute([plan], tmp_path / "out")
+    plan = prepare_plan(*grid, task=PAINT)
+    started: Iterator[Record] = execute.execute([plan], tmp_path / "out")
     next(started)
     started.close()  # type: ignore[attr-defined]
     file = tmp_path / "out" / FILE
@@ -324,7 +325,7 @@ def test_failed_units_are_tried_again(images: Path, tmp_path: Path, monkeypatch:
 
 def test_changed_photograph_or_setting_is_another_cell(images: Path) -> None:
     def cell(**more: Any) -> str:
-        return runner.prepare([Undefended()], [Painter()], images, task=PAINT, **more).experiments[0].metadata["cell_id"]
+        return prepare_plan([Undefended()], [Painter()], images, task=PAINT, **more).experiments[0].metadata["experiment_id"]
 
     first = cell()
     assert cell() == first
@@ -387,14 +388,14 @@ def test_a_device_that_remembers_gives_one_answer_in_all_photographs(images: Pat
 def test_processes_make_the_same_records(images: Path, small: Asset, tmp_path: Path) -> None:
     (images / "bad.jpg").write_bytes(b"no photograph")
     engine = engines.choose_engine(workers=2)
-    plan = runner.prepare([LDP(epsilon=8, dictionary=small), Undefended()], [Painter(), Guess()], images, task=PAINT)
-    alone = runner.sort_records([plan], runner.execute([plan], tmp_path / "alone"))
-    together: Iterator[Record] = runner.execute([plan], tmp_path / "together", engine)
+    plan = prepare_plan([LDP(epsilon=8, dictionary=small), Undefended()], [Painter(), Guess()], images, task=PAINT)
+    alone = execute.sort_records([plan], execute.execute([plan], tmp_path / "alone"))
+    together: Iterator[Record] = execute.execute([plan], tmp_path / "together", engine)
     next(together)
     next(together)
     together.close()  # interrupted after a record  # type: ignore[attr-defined]
-    resumed = list(runner.execute([plan], tmp_path / "together", engine))
-    assert judged(runner.sort_records([plan], resumed)) == judged(alone)
+    resumed = list(execute.execute([plan], tmp_path / "together", engine))
+    assert judged(execute.sort_records([plan], resumed)) == judged(alone)
     assert sum(record["status"] != "failed" for record in written(tmp_path / "together")) == len(alone) - 3  # none twice
     pictures = {path.relative_to(tmp_path / "alone"): path.read_bytes() for path in (tmp_path / "alone").rglob("*.png")}
     assert pictures == {
@@ -415,7 +416,7 @@ def test_selected_keypoints_alone_are_scored_and_painted(images: Path, monkeypat
 def test_foreground_and_background_are_told_apart_in_a_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(store.VARIABLE, str(tmp_path / "cache"))
     place = Gallery(views=1, queries=1, night=0, width=160, height=128, detail=0.2, people=4)
-    (record,) = runner.run([Undefended()], [Painter()], task=PAINT, dataset=place)
+    (record,) = execute.run([Undefended()], [Painter()], task=PAINT, dataset=place)
     mask = place.scene().queries[0].pixels.foreground()
     assert mask is not None
     share = mask.mean()

@@ -1,4 +1,4 @@
-"""Suites, the engines that carry them out, and what is known of a run from its folder."""
+"""Suites, the engines that execute them, and the status of a run from its folder."""
 
 import json
 import os
@@ -14,27 +14,26 @@ import pytest
 from fake_plugins.fatal import Fatal
 from fake_plugins.guess import Guess
 from fake_plugins.painter import Painter
-from fakes import FAKES, album, install
+from fakes import FAKES, check_plan, install_plugins, prepare_plan, write_album
 
 from attacks.dia import DIA
 from bench import cli
-from bench.api import Asset
-from bench.codebook.examples import small_dictionary
+from bench.codebook.examples import write_dictionary
 from bench.core import threads
 from bench.core.errors import UserError
 from bench.datasets.gallery import Gallery
-from bench.runner import directory, engines, suite
-from bench.runner import plan as runner
-from bench.runner.plan import Plan
+from bench.runner import directory, engines, execute, suite
+from bench.runner.plan import Plan, build_plan
 from bench.runner.records import FILE, Log, Record
-from bench.runner.status import Count, status
+from bench.runner.status import Count, read_status
 from bench.runner.suite import Suite, grid
+from bench.settings import Asset
 from bench.tasks.reconstruction import Reconstruction
 from defenses.affine import Affine
 from defenses.ldp import LDP
 from defenses.none import Undefended
 
-PAINT = Reconstruction(inverter="painter")
+RECONSTRUCTION = Reconstruction(inverter="painter")
 MINE = """
 from fake_plugins.painter import Painter
 from bench.runner.suite import Suite, grid
@@ -43,24 +42,24 @@ from defenses.none import Undefended
 
 PARTS = dict(defenses=[Undefended()], attacks=[Painter()], tasks=[Reconstruction(inverter="painter")])
 SUITE = Suite(summary="mine", parts=grid(**PARTS, images="album", seeds=(0, 1)))
-TWICE = Suite(summary="the same cells in two parts", parts=(*SUITE.parts, *SUITE.parts))
+TWICE = Suite(summary="the same experiments in two parts", parts=(*SUITE.parts, *SUITE.parts))
 """
 
 
 @pytest.fixture(autouse=True)
 def _fakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    install(tmp_path / "installed", monkeypatch, FAKES)
+    install_plugins(tmp_path / "installed", monkeypatch, FAKES)
     monkeypatch.chdir(tmp_path)
 
 
 @pytest.fixture
 def images(tmp_path: Path) -> Path:
-    return album(tmp_path / "album", 3)
+    return write_album(tmp_path / "album", 3)
 
 
 @pytest.fixture
 def small(tmp_path: Path) -> Asset:
-    return small_dictionary(tmp_path)
+    return write_dictionary(tmp_path)
 
 
 @pytest.fixture
@@ -74,32 +73,32 @@ def mine(tmp_path: Path, images: Path, monkeypatch: pytest.MonkeyPatch) -> str:
 
 
 def bench(capfd: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
-    status = cli.main([str(argument) for argument in arguments])
+    read_status = cli.main([str(argument) for argument in arguments])
     out, err = capfd.readouterr()
-    return status, out, err
+    return read_status, out, err
 
 
-def lines(out: Path) -> list[Record]:
+def read_records(out: Path) -> list[Record]:
     return [json.loads(line) for line in (out / FILE).read_text().splitlines()]
 
 
-def judged(records: list[Record]) -> list[Any]:
-    """What must not depend on who made the records."""
+def select_engine_independent(records: list[Record]) -> list[Any]:
+    """Return the records without the keys that depend on the engine."""
     return [
         {key: value for key, value in record.items() if key not in ("seconds", "environment", "run_hash")} for record in records
     ]
 
 
-def pictures(out: Path) -> dict[Path, bytes]:
+def read_reconstructions(out: Path) -> dict[Path, bytes]:
     return {path.relative_to(out): path.read_bytes() for path in out.rglob("reconstructions/**/*.png")}
 
 
 # ---- suites
 
 
-def test_grid_is_everything_with_everything() -> None:
+def test_grid_is_the_full_product() -> None:
     parts = grid(
-        defenses=[Undefended(), Affine()], attacks=[Painter(), Guess()], tasks=[PAINT, Reconstruction()], seeds=(0, 1, 2)
+        defenses=[Undefended(), Affine()], attacks=[Painter(), Guess()], tasks=[RECONSTRUCTION, Reconstruction()], seeds=(0, 1, 2)
     )
     assert len(parts) == 6
     assert [part.seed for part in parts] == [0, 1, 2] * 2
@@ -108,29 +107,32 @@ def test_grid_is_everything_with_everything() -> None:
         grid(defenses=[Undefended()])
 
 
-def test_every_suite_of_ours_can_be_planned() -> None:
-    """And the full one holds all others."""
-    found = {name: suite.find(name) for name in suite.names()}
-    assert {"smoke", "paper-table-1", "paper-table-4", "attacks", "full"} <= found.keys()
-    assert all(each.parts and each.summary for each in found.values())
-    assert len(found["full"].parts) == sum(len(each.parts) for name, each in found.items() if name != "full")
-    assert len(runner.planned(found["smoke"].parts[0])) == 9
+def test_every_shipped_suite_can_be_planned() -> None:
+    """The full suite contains all others."""
+    suites = {name: suite.find(name) for name in suite.list_suites()}
+    assert {"smoke", "paper-table-1", "paper-table-4", "attacks", "full"} <= suites.keys()
+    assert all(each.parts and each.summary for each in suites.values())
+    assert len(suites["full"].parts) == sum(len(each.parts) for name, each in suites.items() if name != "full")
+    assert len(build_plan(suites["smoke"].parts[0])) == 9
 
 
-def test_privacy_and_utility_are_told_of_the_same_queries_and_defenses() -> None:
+def test_privacy_and_utility_use_the_same_queries_and_defenses() -> None:
     few = Gallery(views=2, queries=1, night=0.0, width=64, height=48, detail=0.1)
-    attacked, served = (
-        [cell for cell in runner.planned(replace(part, dataset=few)).experiments if cell.reason is None]
+    attacked, localized = (
+        [experiment for experiment in build_plan(replace(part, dataset=few)).experiments if experiment.reason is None]
         for part in suite.find("privacy-utility").parts
     )
-    assert [{cell.metadata["task"] for cell in cells} for cells in (attacked, served)] == [{"reconstruction"}, {"localization"}]
-    assert len({cell.metadata["dataset"]["hash"] for cell in (*attacked, *served)}) == 1
-    adapted = [cell.defense for cell in attacked if isinstance(cell.attack, DIA)]
-    assert adapted == [cell.defense for cell in served]
+    assert [{experiment.metadata["task"] for experiment in experiments} for experiments in (attacked, localized)] == [
+        {"reconstruction"},
+        {"localization"},
+    ]
+    assert len({experiment.metadata["dataset"]["hash"] for experiment in (*attacked, *localized)}) == 1
+    dia_defenses = [experiment.defense for experiment in attacked if isinstance(experiment.attack, DIA)]
+    assert dia_defenses == [experiment.defense for experiment in localized]
 
 
-def test_photographs_of_ones_own() -> None:
-    assert {part.images for part in suite.find("settings").on("photos").parts} == {"photos"}
+def test_suite_with_other_images() -> None:
+    assert {part.images for part in suite.find("settings").with_images("photos").parts} == {"photos"}
 
 
 @pytest.mark.parametrize(
@@ -143,106 +145,112 @@ def test_photographs_of_ones_own() -> None:
         ("no.such.module:SUITE", "no.such.module cannot be imported: ModuleNotFoundError"),
     ],
 )
-def test_suites_that_are_not_there(mine: str, name: str, complaint: str) -> None:
+def test_missing_suites(mine: str, name: str, complaint: str) -> None:
     with pytest.raises(UserError, match=complaint):
         suite.find(name)
 
 
-def test_sweep_of_a_suite_of_ones_own_and_again(mine: str, capfd: pytest.CaptureFixture[str]) -> None:
-    done, shown, told = bench(capfd, "sweep", mine)
-    assert done == 0
-    assert "seed 1" in shown
+def test_sweep_of_a_user_suite_twice(mine: str, capfd: pytest.CaptureFixture[str]) -> None:
+    exit_code, output, messages = bench(capfd, "sweep", mine)
+    assert exit_code == 0
+    assert "seed 1" in output
     out = Path("runs/sweep-mine-SUITE")
-    assert f"written to {out}" in told
-    assert [(record["seed"], record["unit"]) for record in lines(out)] == [(s, f"{u}.png") for s in (0, 1) for u in range(3)]
+    assert f"written to {out}" in messages
+    assert [(record["seed"], record["sample"]) for record in read_records(out)] == [
+        (s, f"{u}.png") for s in (0, 1) for u in range(3)
+    ]
     before = (out / FILE).read_bytes()
-    assert bench(capfd, "sweep", mine)[:2] == (0, shown)
+    assert bench(capfd, "sweep", mine)[:2] == (0, output)
     assert (out / FILE).read_bytes() == before
-    assert bench(capfd, "sweep", "elsewhere/mine.py:TWICE", "--out", out)[0] == 0  # cells that two parts have
+    assert bench(capfd, "sweep", "elsewhere/mine.py:TWICE", "--out", out)[0] == 0  # experiments of two parts
     assert (out / FILE).read_bytes() == before
-    assert "mine" not in bench(capfd, "sweep")[1]  # the list is of ours
+    assert "mine" not in bench(capfd, "sweep")[1]  # only shipped suites are listed
 
 
 # ---- engines
 
 
-def test_engines_are_chosen_with_what_they_need() -> None:
+def test_engines_require_their_options() -> None:
     assert engines.choose_engine() is engines.IN_PROCESS
-    for asked, complaint in [
+    for arguments, complaint in [
         ((0,), "--workers must be at least 1"),
         ((1, "dusk"), "unknown engine 'dusk'; did you mean 'dask'"),
         ((1, "dask"), "--scheduler is missing"),
         ((1, "processes", "tcp://x:1"), "--scheduler is for --engine dask"),
     ]:
         with pytest.raises(UserError, match=complaint):
-            engines.choose_engine(*asked)
+            engines.choose_engine(*arguments)
 
 
 def test_processes_share_the_cores(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is started from here is limited, whichever library it computes with."""
+    """Child processes are limited, for each numerical library."""
     for variable in threads.VARIABLES:
         monkeypatch.setenv(variable, "7")
-    monkeypatch.setattr(threads, "cores", lambda: 4)
-    threads.limit.cache_clear()
+    monkeypatch.setattr(threads, "count_cores", lambda: 4)
+    threads.limit_threads.cache_clear()
     engine = engines.choose_engine(2)
     assert engine.describe([])["threads"] == 2
     assert {os.environ[variable] for variable in threads.VARIABLES} == {"2"}
-    counted = "import numpy, torch, threadpoolctl; print({p['num_threads'] for p in threadpoolctl.threadpool_info()})"
-    assert subprocess.check_output([sys.executable, "-c", counted], text=True).strip() in ("{2}", "{1, 2}", "{1}")
-    threads.limit.cache_clear()
+    code = "import numpy, torch, threadpoolctl; print({p['num_threads'] for p in threadpoolctl.threadpool_info()})"
+    assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() in ("{2}", "{1, 2}", "{1}")
+    threads.limit_threads.cache_clear()
 
 
-def test_a_process_that_is_killed_stops_the_run_and_the_rest_is_done_next_time(images: Path, tmp_path: Path) -> None:
+def test_a_killed_process_stops_the_run_and_the_next_run_resumes(images: Path, tmp_path: Path) -> None:
     engine = engines.choose_engine(2)
     marker = tmp_path / "killed"
-    plan = runner.prepare([Undefended()], [Painter(), Fatal(marker=str(marker))], images, task=PAINT)
+    plan = prepare_plan([Undefended()], [Painter(), Fatal(marker=str(marker))], images, task=RECONSTRUCTION)
     with pytest.raises(UserError, match=r"ended from outside.*run again to go on"):
-        list(runner.execute([plan], tmp_path / "out", engine))
+        list(execute.execute([plan], tmp_path / "out", engine))
     assert marker.exists()
-    assert len(list(runner.execute([plan], tmp_path / "out", engine))) == 6
-    keys = [(record["cell_id"], record["unit"]) for record in lines(tmp_path / "out")]
+    assert len(list(execute.execute([plan], tmp_path / "out", engine))) == 6
+    keys = [(record["experiment_id"], record["sample"]) for record in read_records(tmp_path / "out")]
     assert len(keys) == len(set(keys)) == 6
 
 
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    """Two workers, processes that know the made-up plugins."""
+    """Two worker processes that have the fake plugins."""
     distributed = pytest.importorskip("distributed", reason="needs dask.distributed: pip install distributed")
     with pytest.MonkeyPatch.context() as patch:
-        install(tmp_path_factory.mktemp("workers"), patch, FAKES)
-        started = distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50)
-    with started:
-        yield started
+        install_plugins(tmp_path_factory.mktemp("workers"), patch, FAKES)
+        local_cluster = distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50)
+    with local_cluster:
+        yield local_cluster
 
 
 def test_two_workers_one_of_them_killed(images: Path, small: Asset, tmp_path: Path, cluster: Any) -> None:
-    """Nothing is lost, nothing is double, and records and pictures are those of one process."""
+    """No record is lost or duplicated, and records and reconstructions equal those of one process."""
     (images / "bad.jpg").write_bytes(b"no photograph")
     marker = tmp_path / "killed"
     attacks = [Painter(), Guess(), Fatal(marker=str(marker))]
-    parts = grid(defenses=[LDP(epsilon=8, dictionary=small), Undefended()], attacks=attacks, tasks=[PAINT], images=images)
+    parts = grid(
+        defenses=[LDP(epsilon=8, dictionary=small), Undefended()], attacks=attacks, tasks=[RECONSTRUCTION], images=images
+    )
     engine = engines.choose_engine(kind="dask", scheduler=cluster.scheduler_address)
     before = {worker.pid for worker in cluster.workers.values()}
-    plans = [runner.prepared(part, engine.describe) for part in parts]
-    found = runner.sort_records(plans, runner.execute(plans, tmp_path / "many", engine))
+    plans = [check_plan(build_plan(part, engine.describe)) for part in parts]
+    records = execute.sort_records(plans, execute.execute(plans, tmp_path / "many", engine))
     assert marker.exists()
-    assert before != {worker.pid for worker in cluster.workers.values()}  # one of them is gone
-    keys = [(record["run_hash"], record["unit"]) for record in lines(tmp_path / "many")]
+    assert before != {worker.pid for worker in cluster.workers.values()}  # one of them has ended
+    keys = [(record["run_hash"], record["sample"]) for record in read_records(tmp_path / "many")]
     assert len(keys) == len(set(keys)) == len(plans[0])
-    alone = [runner.prepared(part) for part in parts]
-    assert judged(found) == judged(runner.sort_records(alone, runner.execute(alone, tmp_path / "one")))
-    assert {record["status"] for record in found} == {"ok", "failed", "n/a"}
-    assert pictures(tmp_path / "many") == pictures(tmp_path / "one") != {}
-    assert {record["environment"]["threads"] for record in found} == {1}
-    again = list(runner.execute(plans, tmp_path / "many", engine))  # only what failed is tried again
-    assert len(lines(tmp_path / "many")) == len(keys) + sum(record["status"] == "failed" for record in again)
+    single_plans = [check_plan(build_plan(part)) for part in parts]
+    assert select_engine_independent(records) == select_engine_independent(
+        execute.sort_records(single_plans, execute.execute(single_plans, tmp_path / "one"))
+    )
+    assert {record["status"] for record in records} == {"ok", "failed", "n/a"}
+    assert read_reconstructions(tmp_path / "many") == read_reconstructions(tmp_path / "one") != {}
+    assert {record["environment"]["threads"] for record in records} == {1}
+    again = list(execute.execute(plans, tmp_path / "many", engine))  # only failed samples run again
+    assert len(read_records(tmp_path / "many")) == len(keys) + sum(record["status"] == "failed" for record in again)
 
 
-def test_what_kills_every_worker_is_a_failed_record(images: Path, tmp_path: Path, cluster: Any) -> None:
+def test_an_attack_that_kills_every_worker_is_a_failed_record(images: Path, tmp_path: Path, cluster: Any) -> None:
     engine = engines.choose_engine(kind="dask", scheduler=cluster.scheduler_address)
-    part = grid(defenses=[Undefended()], attacks=[Fatal(), Painter()], tasks=[PAINT], images=[images / "0.png"])[0]
-    plan = runner.prepared(part, engine.describe)
-    fatal, painter = runner.sort_records([plan], runner.execute([plan], tmp_path / "out", engine))
+    part = grid(defenses=[Undefended()], attacks=[Fatal(), Painter()], tasks=[RECONSTRUCTION], images=[images / "0.png"])[0]
+    plan = check_plan(build_plan(part, engine.describe))
+    fatal, painter = execute.sort_records([plan], execute.execute([plan], tmp_path / "out", engine))
     assert (fatal["status"], painter["status"]) == ("failed", "ok")
     assert "every worker that began this ended" in fatal["reason"]
 
@@ -250,14 +258,14 @@ def test_what_kills_every_worker_is_a_failed_record(images: Path, tmp_path: Path
 def test_a_worker_with_other_files_is_refused(images: Path, tmp_path: Path, cluster: Any) -> None:
     """It would make other records."""
     engine = engines.choose_engine(kind="dask", scheduler=cluster.scheduler_address)
-    part = grid(defenses=[Undefended()], attacks=[Painter()], tasks=[PAINT], images=images)[0]
-    plan = runner.prepared(part, engine.describe)
-    album(images, 4)
+    part = grid(defenses=[Undefended()], attacks=[Painter()], tasks=[RECONSTRUCTION], images=images)[0]
+    plan = check_plan(build_plan(part, engine.describe))
+    write_album(images, 4)
     with pytest.raises(UserError, match="other source, libraries or files"):
-        list(runner.execute([plan], tmp_path / "out", engine))
+        list(execute.execute([plan], tmp_path / "out", engine))
 
 
-def test_a_scheduler_that_is_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_scheduler(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed", reason="needs dask.distributed: pip install distributed")
     from bench.runner.engines import cluster as module
 
@@ -266,36 +274,36 @@ def test_a_scheduler_that_is_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
         engines.choose_engine(kind="dask", scheduler="tcp://127.0.0.1:9").describe([])
 
 
-# ---- what a folder tells
+# ---- the status of a run
 
 
 @pytest.fixture
 def plan(images: Path) -> Plan:
-    return runner.prepare([Undefended(), Affine(lifting="random")], [Painter(), Guess()], images, task=PAINT)
+    return prepare_plan([Undefended(), Affine(lifting="random")], [Painter(), Guess()], images, task=RECONSTRUCTION)
 
 
-def test_status_from_nothing_to_the_end(plan: Plan, tmp_path: Path) -> None:
+def test_status_from_start_to_end(plan: Plan, tmp_path: Path) -> None:
     out = tmp_path / "out"
     with pytest.raises(UserError, match="nothing was run there"):
-        status(out)
-    running: Iterator[Record] = runner.execute([plan], out)
-    next(running)  # what does not apply
-    begun = status(out)
-    assert (begun.count, begun.explain_not_applicable, begun.alive) == (Count(missing=9), 1, True)
+        read_status(out)
+    running: Iterator[Record] = execute.execute([plan], out)
+    next(running)  # the pair that does not apply
+    first = read_status(out)
+    assert (first.count, first.explain_not_applicable, first.alive) == (Count(missing=9), 1, True)
     next(running)
     next(running)
-    middle = status(out)
+    middle = read_status(out)
     assert (middle.count, middle.alive) == (Count(done=2, missing=7), True)
     assert middle.writer is not None
     assert middle.writer["pid"] == os.getpid()
     running.close()  # type: ignore[attr-defined]
-    ended = status(out)
+    ended = read_status(out)
     assert (ended.count, ended.writer, ended.alive) == (Count(done=2, missing=7), None, False)
-    list(runner.execute([plan], out))
-    assert status(out).count == Count(done=9)
+    list(execute.execute([plan], out))
+    assert read_status(out).count == Count(done=9)
 
 
-def test_what_is_in_hand_is_running_and_what_a_killed_process_left_is_not(plan: Plan, tmp_path: Path) -> None:
+def test_samples_in_progress_are_running_until_their_process_is_killed(plan: Plan, tmp_path: Path) -> None:
     out = tmp_path / "out"
     code = """
 import sys, time
@@ -310,27 +318,27 @@ def forever(self, view, rng):
     time.sleep(1000)
 
 Painter.reconstruct = forever
-plan = runner.prepare([Undefended()], [Painter()], "album", task=Reconstruction(inverter="painter"))
-list(runner.execute([plan], Path("out")))
+plan = prepare_plan([Undefended()], [Painter()], "album", task=Reconstruction(inverter="painter"))
+list(execute.execute([plan], Path("out")))
 """
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, env=environment) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == "begun\n"
-        found = status(out)
-        assert (found.count, found.alive) == (Count(running=1, missing=2), True)
+        current = read_status(out)
+        assert (current.count, current.alive) == (Count(running=1, missing=2), True)
         with pytest.raises(UserError, match=r"another process is writing to .*records\.jsonl"):
-            list(runner.execute([plan], out))
+            list(execute.execute([plan], out))
         process.kill()
-    dead = status(out)
+    dead = read_status(out)
     assert (dead.count, dead.alive) == (Count(missing=3), False)
     assert dead.writer is not None
     assert dead.writer["pid"] == process.pid
-    assert len(list(runner.execute([plan], out))) == 10  # the lock is gone with its owner
+    assert len(list(execute.execute([plan], out))) == 10  # the lock was released with its process
     assert not (out / directory.RUNNING).exists()
 
 
-def test_failed_units_and_records_of_other_runs_are_told_apart(
+def test_failed_samples_and_records_of_other_runs_are_counted_separately(
     images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     (images / "bad.jpg").write_bytes(b"no photograph")
@@ -349,10 +357,10 @@ def test_failed_units_and_records_of_other_runs_are_told_apart(
     )
     assert bench(capfd, "run", *common)[0] == 1
     assert bench(capfd, "run", *common, "--seed", 1)[0] == 1
-    shown = bench(capfd, "status", "--results", out)
-    assert shown[0] == 0
-    assert "3 done, 0 running, 1 failed, 0 missing; 4 records of other runs" in shown[1]
-    assert "painter" in shown[1]
+    result = bench(capfd, "status", "--results", out)
+    assert result[0] == 0
+    assert "3 done, 0 running, 1 failed, 0 missing; 4 records of other runs" in result[1]
+    assert "painter" in result[1]
     overview = bench(capfd, "status")[1]
     assert "x" in overview
     assert "3 done" in overview
@@ -361,7 +369,7 @@ def test_failed_units_and_records_of_other_runs_are_told_apart(
     assert bench(capfd, "status", "x", "--results", out)[0] == 2
 
 
-def test_a_full_disk_loses_nothing_that_was_written(
+def test_a_full_disk_loses_no_written_record(
     mine: str, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     written, append = [], Log.append
@@ -374,34 +382,34 @@ def test_a_full_disk_loses_nothing_that_was_written(
 
     with monkeypatch.context() as small_disk:
         small_disk.setattr(Log, "append", full)
-        ended, _, told = bench(capfd, "sweep", mine)
-    assert ended == 1
-    assert "No space left" in told
-    assert "run the same command again" in told
+        exit_code, _, messages = bench(capfd, "sweep", mine)
+    assert exit_code == 1
+    assert "No space left" in messages
+    assert "run the same command again" in messages
     out = Path("runs/sweep-mine-SUITE")
-    assert lines(out) == written
+    assert read_records(out) == written
     assert bench(capfd, "sweep", mine)[0] == 0
-    assert lines(out)[:4] == written
-    assert len(lines(out)) == 6
+    assert read_records(out)[:4] == written
+    assert len(read_records(out)) == 6
 
 
-def test_interrupted_sweep_goes_on(mine: str, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
-    asked: list[int] = []
-    kept: Callable[..., Any] = Painter.reconstruct
+def test_interrupted_sweep_resumes(mine: str, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
+    calls: list[int] = []
+    reconstruct: Callable[..., Any] = Painter.reconstruct
 
     def interrupted(self: Any, view: Any, rng: Any) -> Any:
-        asked.append(1)
-        if len(asked) == 3:
+        calls.append(1)
+        if len(calls) == 3:
             raise KeyboardInterrupt
-        return kept(self, view, rng)
+        return reconstruct(self, view, rng)
 
     monkeypatch.setattr(Painter, "reconstruct", interrupted)
-    ended, _, told = bench(capfd, "sweep", mine)
-    assert ended == 130
-    assert "run the same command again to go on" in told
-    assert status(Path("runs/sweep-mine-SUITE")).count == Count(done=2, missing=4)
+    exit_code, _, messages = bench(capfd, "sweep", mine)
+    assert exit_code == 130
+    assert "run the same command again to go on" in messages
+    assert read_status(Path("runs/sweep-mine-SUITE")).count == Count(done=2, missing=4)
     assert bench(capfd, "sweep", mine)[0] == 0
-    assert len(asked) == 7
+    assert len(calls) == 7
     assert isinstance(suite.find(mine), Suite)
 
 
@@ -411,8 +419,8 @@ DOCUMENT = (Path(__file__).resolve().parents[2] / "docs" / "sweeps.md").read_tex
 
 
 @pytest.mark.parametrize("line", re.findall(r"^bench (.+?)(?:\s+#.*)?$", DOCUMENT, re.MULTILINE))
-def test_commands_of_the_documentation_are_understood(line: str) -> None:
-    args, extra = cli.parser().parse_known_args(line.split())
+def test_commands_of_the_documentation_parse(line: str) -> None:
+    args, extra = cli.build_parser().parse_known_args(line.split())
     assert not extra
     assert all(getattr(args, option) for option in args.required)
 

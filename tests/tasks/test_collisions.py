@@ -4,26 +4,26 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fakes import trial
+from fakes import build_trial
 
-from bench.api import Asset
-from bench.codebook.examples import example_features, small_dictionary
+from bench.codebook.examples import draw_features, write_dictionary
 from bench.codebook.public import Public
 from bench.core.errors import UserError
 from bench.extractors.sift import Sift
 from bench.geometry.nearest_words import unit_rows
-from bench.geometry.shared_sub_database import company, nearest_that_meet, stacked
-from bench.tasks.collisions import Collisions, no_collision
+from bench.geometry.shared_sub_database import compute_intersection_distances, find_shared_sub_database, stack_subspaces
+from bench.settings import Asset
+from bench.tasks.collisions import Collisions, is_collision_free
 from bench.types import Features, Subspaces
 from defenses.affine import Affine
 from defenses.ldp import LDP
 
-OWN = example_features(10, seed=0)
+OWN = draw_features(10, seed=0)
 
 
 @pytest.fixture
 def database(tmp_path: Path) -> Asset:
-    return small_dictionary(tmp_path, 24)
+    return write_dictionary(tmp_path, 24)
 
 
 def lifting(database: Asset, dim: int = 4) -> Affine:
@@ -45,8 +45,8 @@ def test_distances_to_what_meets_are_those_of_brute_force(database: Asset) -> No
     lifted = defense.lift(OWN, public, np.random.default_rng(0))
     words = unit_rows(public.dictionary(database).words)
     points = np.concatenate([OWN.descriptors[:, None], words[lifted.words]], axis=1).astype(np.float64)  # (10, 3, D)
-    (other,) = releases(defense, [example_features(8, seed=11)])
-    every = stacked([lifted.release, other])
+    (other,) = releases(defense, [draw_features(8, seed=11)])
+    every = stack_subspaces([lifted.release, other])
     expected = np.full((10, 3), np.inf)
     for i in range(10):
         o1, b1 = lifted.release.origins[i].astype(np.float64), lifted.release.bases[i].astype(np.float64)
@@ -54,28 +54,28 @@ def test_distances_to_what_meets_are_those_of_brute_force(database: Asset) -> No
             o2, b2 = every.origins[j].astype(np.float64), every.bases[j].astype(np.float64)
             if i != j and residual(o2 - o1, np.concatenate([b1, b2])) < 1e-5:
                 expected[i] = np.minimum(expected[i], [residual(point - o2, b2) for point in points[i]])
-    shared = company(lifted.release, iter([other]), 2, enough=1)
-    assert shared.kept == 1
-    np.testing.assert_allclose(nearest_that_meet(points, shared), expected, atol=1e-5)
+    shared = find_shared_sub_database(lifted.release, iter([other]), 2, enough=1)
+    assert shared.sharing == 1
+    np.testing.assert_allclose(compute_intersection_distances(points, shared), expected, atol=1e-5)
     assert 0 < (expected[:, 1:] < 1e-5).sum() < 20
 
 
 def test_no_collision_by_hand() -> None:
     inf = np.inf
     nearest = np.array([[0.9, 0.0, 0.0], [0.9, 0.0, 0.85], [0.9, 0.0, inf], [inf, inf, inf], [0.0, 0.0, 0.0], [0.05, 0.0, 0.0]])
-    assert no_collision(nearest, 0.0).tolist() == [True, True, False, False, False, True]
-    assert no_collision(nearest, 0.1).tolist() == [True, False, False, False, False, False]
+    assert is_collision_free(nearest, 0.0).tolist() == [True, True, False, False, False, True]
+    assert is_collision_free(nearest, 0.1).tolist() == [True, False, False, False, False, False]
 
 
 def metrics(database: Asset, secrets: list[Features], dim: int = 4, **more: float) -> dict[str, float]:
     defense = lifting(database, dim)
     others = releases(defense, secrets)
-    found = Collisions(others=len(others), coverage=1, **more).evaluate(trial(defense, OWN, others=others)).metrics
+    found = Collisions(others=len(others), coverage=1, **more).evaluate(build_trial(defense, OWN, others=others)).metrics
     return {name: value for name, value in found.items() if value is not None}
 
 
 def test_enough_other_releases_meet_every_word_and_none_comes_near(database: Asset) -> None:
-    found = metrics(database, [example_features(40, seed=seed) for seed in range(11, 15)])
+    found = metrics(database, [draw_features(40, seed=seed) for seed in range(11, 15)])
     assert found == {
         "no_collision": 1,
         "no_collision_covered": 1,
@@ -87,18 +87,18 @@ def test_enough_other_releases_meet_every_word_and_none_comes_near(database: Ass
 
 
 def test_a_release_of_the_same_descriptors_collides_with_all(database: Asset) -> None:
-    found = metrics(database, [example_features(40, seed=11), OWN])
+    found = metrics(database, [draw_features(40, seed=11), OWN])
     assert found["no_collision"] == 0
     assert found["no_collision_covered"] == 0
 
 
 def test_a_tolerance_above_every_distance_leaves_nothing(database: Asset) -> None:
-    assert metrics(database, [example_features(40, seed=11)], tolerance=2.0)["no_collision"] == 0
+    assert metrics(database, [draw_features(40, seed=11)], tolerance=2.0)["no_collision"] == 0
 
 
 def test_releases_of_another_database_meet_nothing(database: Asset, tmp_path: Path) -> None:
-    others = releases(lifting(small_dictionary(tmp_path, 24, seed=9)), [example_features(40, seed=11)])
-    found = Collisions(others=1).evaluate(trial(lifting(database), OWN.take(np.arange(1)), others=others)).metrics
+    others = releases(lifting(write_dictionary(tmp_path, 24, seed=9)), [draw_features(40, seed=11)])
+    found = Collisions(others=1).evaluate(build_trial(lifting(database), OWN.take(np.arange(1)), others=others)).metrics
     assert found["releases_asked"] == 1
     assert (found["coverage"], found["no_collision"], found["releases_kept"]) == (0, 0, 0)
     assert found["no_collision_covered"] is None
@@ -106,8 +106,8 @@ def test_releases_of_another_database_meet_nothing(database: Asset, tmp_path: Pa
 
 def test_only_as_many_others_as_asked_for(database: Asset) -> None:
     defense = lifting(database)
-    others = releases(defense, [example_features(40, seed=seed) for seed in (11, 12, 13)])
-    assert Collisions(others=2, coverage=1).evaluate(trial(defense, OWN, others=others)).metrics["releases_asked"] == 2
+    others = releases(defense, [draw_features(40, seed=seed) for seed in (11, 12, 13)])
+    assert Collisions(others=2, coverage=1).evaluate(build_trial(defense, OWN, others=others)).metrics["releases_asked"] == 2
 
 
 def test_what_does_not_fit_is_refused(database: Asset) -> None:

@@ -4,24 +4,24 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fakes import trial
+from fakes import build_trial
 
-from bench.codebook.examples import example_features, small_dictionary
+from bench.codebook.examples import draw_features, write_dictionary
 from bench.codebook.public import Public
 from bench.core.errors import UserError
 from bench.extractors.sift import Sift
 from bench.geometry.nearest_words import unit_rows
-from bench.tasks.intersections import COUNTS, Intersections, matches, rounds, without
+from bench.tasks.intersections import COUNTS, Intersections, draw_rounds, drop_left_out, pass_ratio_test
 from defenses.affine import Affine
 from defenses.ldp import LDP
 
 
 def brute_force(defense: Affine, count: int, ratio: float, seed: int) -> dict[str, float]:
     """The measure by its definition: every word's distance to every subspace, one at a time, in float64."""
-    public, secret, rng = Public(), example_features(12), np.random.default_rng(seed)
+    public, secret, rng = Public(), draw_features(12), np.random.default_rng(seed)
     words = unit_rows(public.dictionary(defense.database).words).astype(np.float64)
     found: dict[str, list[bool]] = {f"{name}_top{top}": [] for name in ("success", "with_adversarial") for top in COUNTS}
-    for part in rounds(secret, count, rng):
+    for part in draw_rounds(secret, count, rng):
         lifted = defense.lift(part, public, rng)
         for row in range(len(part)):
             basis, origin = lifted.release.bases[row].astype(np.float64), lifted.release.origins[row].astype(np.float64)
@@ -42,9 +42,9 @@ def brute_force(defense: Affine, count: int, ratio: float, seed: int) -> dict[st
 
 @pytest.mark.parametrize(("dim", "count"), [(2, 12), (4, 30), (10, 5)])
 def test_measure_is_that_of_brute_force(tmp_path: Path, dim: int, count: int) -> None:
-    defense = Affine(dim=dim, database=small_dictionary(tmp_path, 160))
+    defense = Affine(dim=dim, database=write_dictionary(tmp_path, 160))
     task = Intersections(subspaces=count, ratio=0.95)
-    metrics = task.evaluate(trial(defense, example_features(12), rng=np.random.default_rng(5))).metrics
+    metrics = task.evaluate(build_trial(defense, draw_features(12), rng=np.random.default_rng(5))).metrics
     expected = brute_force(defense, count, 0.95, 5)
     assert {name: metrics[name] for name in expected} == pytest.approx(expected)
     assert metrics["subspaces"] == count
@@ -53,8 +53,8 @@ def test_measure_is_that_of_brute_force(tmp_path: Path, dim: int, count: int) ->
 
 def test_adversarial_words_succeed_by_construction(tmp_path: Path) -> None:
     """Why they are left out: at dimension 10 and N = 5 they alone are counted, and the data does not matter."""
-    task, defense = Intersections(), Affine(dim=10, database=small_dictionary(tmp_path, 160))
-    metrics = task.evaluate(trial(defense, example_features(12))).metrics
+    task, defense = Intersections(), Affine(dim=10, database=write_dictionary(tmp_path, 160))
+    metrics = task.evaluate(build_trial(defense, draw_features(12))).metrics
     assert metrics["with_adversarial_top5"] == 1
     assert metrics["success_top5"] is not None
     assert metrics["success_top5"] < 1
@@ -64,27 +64,27 @@ def test_words_around_the_points_succeed_and_words_between_them_fail(rng: np.ran
     points = unit_rows(rng.normal(size=(1, 3, 128)).astype(np.float32))
     around = unit_rows(points[:, [0, 0, 1, 2]] + 0.02 * rng.normal(size=(1, 4, 128)).astype(np.float32))
     between = unit_rows(points[:, [0, 0, 1]] + points[:, [1, 2, 2]])
-    assert matches(around, points, 0.8).all()
-    assert not matches(between, points, 0.8).any()
+    assert pass_ratio_test(around, points, 0.8).all()
+    assert not pass_ratio_test(between, points, 0.8).any()
 
 
 def test_what_is_left_out_makes_room_for_the_next() -> None:
     match = np.array([[True, False, False, True], [False, True, True, True]])
     left_out = np.array([[True, False, False, False], [False, False, True, False]])
-    assert without(match, left_out, 2).tolist() == [[False, False], [False, True]]
-    assert without(match, left_out, 3).tolist() == [[False, False, True], [False, True, True]]
+    assert drop_left_out(match, left_out, 2).tolist() == [[False, False], [False, True]]
+    assert drop_left_out(match, left_out, 3).tolist() == [[False, False, True], [False, True, True]]
 
 
 @pytest.mark.parametrize(("count", "times"), [(5, {0, 1}), (12, {1}), (30, {2, 3})])
 def test_all_descriptors_are_lifted_equally_often(rng: np.random.Generator, count: int, times: set[int]) -> None:
-    secret = example_features(12)
-    lifted = np.concatenate([part.keypoints[:, 0] for part in rounds(secret, count, rng)])
+    secret = draw_features(12)
+    lifted = np.concatenate([part.keypoints[:, 0] for part in draw_rounds(secret, count, rng)])
     assert len(lifted) == count
     assert {int((lifted == x).sum()) for x in secret.keypoints[:, 0]} == times
 
 
 def test_defenses_without_words_are_refused(tmp_path: Path) -> None:
-    small = small_dictionary(tmp_path)
+    small = write_dictionary(tmp_path)
     task = Intersections()
     assert task.explain_not_applicable(Affine(database=small), None, Sift(), Public()) is None
     assert "ldp does not say" in str(task.explain_not_applicable(LDP(dictionary=small), None, Sift(), Public()))

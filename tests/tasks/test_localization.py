@@ -11,19 +11,20 @@ from gallery_stretch import KEPT, STRETCH, WALK
 
 from attacks.inlier import Inlier
 from bench import cli
-from bench.api import Asset, Defense
+from bench.api import Defense
 from bench.cache import store
-from bench.codebook.examples import small_dictionary
+from bench.codebook.examples import write_dictionary
 from bench.core.errors import UserError
 from bench.datasets import aachen
 from bench.datasets.aachen import Aachen
 from bench.extractors.sift import Sift
-from bench.formats import lists, scene_export
+from bench.formats import lists, pairs, scene_export
 from bench.images.scene import Scene
-from bench.localization import pairs, pose
-from bench.runner import plan
+from bench.localization import pose
+from bench.runner import execute
 from bench.runner.records import Record
-from bench.tasks.localization import THRESHOLDS, Localization, within
+from bench.settings import Asset
+from bench.tasks.localization import THRESHOLDS, Localization, score_pose
 from defenses.affine import Affine
 from defenses.ldp import LDP
 from defenses.none import Undefended
@@ -54,7 +55,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run(place: Path, *defenses: Defense, **task: object) -> list[Record]:
-    return plan.run(list(defenses), task=Localization(trials=3000, **task), dataset=Aachen(path=place), extractor=SIFT)
+    return execute.run(list(defenses), task=Localization(trials=3000, **task), dataset=Aachen(path=place), extractor=SIFT)
 
 
 def mean(records: list[Record], metric: str = STRICT) -> float:
@@ -71,10 +72,10 @@ def test_poses_and_what_was_retrieved_are_recorded(place: Path, raw: list[Record
     truth = {query.name: query.cam_from_world for query in aachen.load(place).queries}
     names = {reference.name for reference in aachen.load(place).references}
     for record in raw:
-        found = lists.pose([repr(value) for value in record["estimates"]["pose"]], "here")
-        true = truth[record["unit"]]
+        found = lists.parse_pose([repr(value) for value in record["estimates"]["pose"]], "here")
+        true = truth[record["sample"]]
         assert true is not None
-        apart, turned = pose.errors(found, true)
+        apart, turned = pose.compute_errors(found, true)
         assert (apart, turned) == pytest.approx((record["metrics"]["translation_error"], record["metrics"]["rotation_error"]))
         assert set(record["estimates"]["retrieved"]) == names  # of so few all
         assert 0 < record["metrics"]["trials"] <= 3000
@@ -86,10 +87,10 @@ def test_exact_poses_score_everything_and_twice_the_size_nothing(place: Path) ->
         assert true is not None
         larger = type(true)(true.rotation, 2 * true.translation)
         for found, expected in ((true, 1.0), (larger, 0.0)):
-            scores = within(pose.errors(found, true))
+            scores = score_pose(pose.compute_errors(found, true))
             assert [scores[f"recall_{name}"] for name in THRESHOLDS] == [expected] * len(THRESHOLDS)
-    assert within(None)[STRICT] == 0.0
-    assert within(None)["translation_error"] is None
+    assert score_pose(None)[STRICT] == 0.0
+    assert score_pose(None)["translation_error"] is None
 
 
 # ---- matchers and retrieval
@@ -138,7 +139,7 @@ def _retrieved(record: Record) -> list[str]:
 def test_the_inlier_attack_verifies_whatever_the_server_can_localize(place: Path) -> None:
     """Of subspaces all references are tried, for they do not tell which to retrieve; random words verify next to nothing."""
     random = LDP(dictionary=Asset("references"), words=1000, epsilon=0.0)
-    found = plan.run([Undefended(), Affine(), random], [Inlier(retrieved=1, trials=3000)], dataset=Aachen(path=place))
+    found = execute.run([Undefended(), Affine(), random], [Inlier(retrieved=1, trials=3000)], dataset=Aachen(path=place))
     verified: dict[str, list[int]] = {}
     for record in found:
         verified.setdefault(record["defense"]["name"], []).append(int(record["notes"][-1].split()[0]))
@@ -157,7 +158,7 @@ def test_no_budget_localizes_nothing(place: Path) -> None:
 
 def test_words_made_up_at_random_localize_if_both_sides_have_them(place: Path, tmp_path: Path) -> None:
     """They are a hash: near descriptors have the same nearest word. With too few of them nothing is told apart."""
-    many, few = (LDP(dictionary=small_dictionary(tmp_path, size), epsilon=np.inf, subset_size=1) for size in (2000, 200))
+    many, few = (LDP(dictionary=write_dictionary(tmp_path, size), epsilon=np.inf, subset_size=1) for size in (2000, 200))
     assert mean(run(place, many)) >= 0.8
     assert mean(run(place, few)) <= 0.4
 
@@ -209,7 +210,7 @@ def test_withheld_poses_are_handed_in_and_failures_are_counted(
         for name, (_, there) in found.items():
             true = truth[name]
             assert true is not None
-            assert pose.errors(there, true)[0] < 0.25
+            assert pose.compute_errors(there, true)[0] < 0.25
     for record in records:
         if record["status"] == "ok":
             assert not {STRICT, "translation_error"} & record["metrics"].keys()
@@ -228,7 +229,7 @@ def test_wrong_intrinsics_are_reported_and_not_averaged(
     status, records = bench(edited(place, tmp_path / "wrong", _longer), tmp_path / "out", "--defense", "none")
     assert status == 1
     failed = [record for record in records if record["status"] == "failed"]
-    assert [record["unit"] for record in failed] == [raw[0]["unit"]]
+    assert [record["sample"] for record in failed] == [raw[0]["sample"]]
     assert "its intrinsics do not fit; its raw features ask for 0.6" in failed[0]["reason"]
     assert failed[0]["metrics"] == {}
     assert failed[0]["reason"] in capsys.readouterr().out
@@ -238,15 +239,15 @@ def test_wrong_intrinsics_are_reported_and_not_averaged(
 def test_pairs_are_written_and_read_again(place: Path, raw: list[Record], tmp_path: Path) -> None:
     written = tmp_path / "pairs.txt"
     assert next(localization_results.write(raw, tmp_path)) == f"{written}: what was retrieved for 5 queries"
-    assert pairs.read(written) == {record["unit"]: _retrieved(record) for record in raw}
+    assert pairs.read(written) == {record["sample"]: _retrieved(record) for record in raw}
     again = run(place, Undefended(), pairs=written)
     assert [record["metrics"] for record in again] == [record["metrics"] for record in raw]
     kept = {query: references[:2] for query, references in pairs.read(written).items()}
     pairs.write(written, kept)
     fewer = run(place, Undefended(), pairs=written)
-    assert {record["unit"]: _retrieved(record) for record in fewer} == kept
+    assert {record["sample"]: _retrieved(record) for record in fewer} == kept
     assert mean(fewer, "matches") < mean(raw, "matches")
-    other = [{**record, "cell_id": "other", "defense": {"name": "affine", "dim": 2}} for record in fewer]
+    other = [{**record, "experiment_id": "other", "defense": {"name": "affine", "dim": 2}} for record in fewer]
     assert len(list(localization_results.write([*raw, *other], tmp_path))) == 4  # of each its pairs and its poses
     assert pairs.read(tmp_path / "pairs-affine_dim_2-seed0.txt") == kept
 

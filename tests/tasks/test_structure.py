@@ -8,20 +8,22 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
-from fakes import scene, trial
+from fakes import write_scene, build_trial
 from scipy.spatial.transform import Rotation
 
-from bench.api import Asset, Dataset, Defense, Outcome
-from bench.codebook.examples import example_features, small_dictionary
+from bench.api import Dataset, Defense
+from bench.codebook.examples import draw_features, write_dictionary
 from bench.codebook.public import Public
 from bench.core.errors import UserError
 from bench.datasets.gallery import Gallery
 from bench.datasets.walk import Walk
 from bench.images.scene import File, Scene, SceneImage
+from bench.settings import Asset
 from bench.sfm import agreement, consistency, incremental_mapping, picture, verification
 from bench.sfm.incremental_mapping import Mapper, Model
 from bench.sfm.verification import Pair
-from bench.tasks.structure import Structure, measured
+from bench.task_api import Outcome
+from bench.tasks.structure import Structure, compute_metrics
 from bench.testing import shot
 from bench.types import Features, Indices
 from defenses.affine import Affine
@@ -85,7 +87,7 @@ def test_support_by_enumeration(rng: np.random.Generator) -> None:
     near = (np.abs(first[:, None] - first[None]) <= 30).all(axis=2)
     alike = (np.abs(moved[:, None] - moved[None]) <= 40).all(axis=2)
     expected = (near & alike).sum(axis=1) - 1
-    assert consistency.support(first, second, 30, 40).tolist() == expected.tolist()
+    assert consistency.count_support(first, second, 30, 40).tolist() == expected.tolist()
     assert len(set(expected.tolist())) > 2
 
 
@@ -93,15 +95,15 @@ def test_matches_that_support_trusted_ones_by_enumeration(rng: np.random.Generat
     first, second = rng.uniform(0, 100, (2, 50, 2))
     trusted, moved = np.array([3, 17, 41]), second - first
     near = (np.abs(first[:, None] - first[trusted]) <= consistency.NEAR * 300).all(axis=2)
-    alike = (np.abs(moved[:, None] - moved[trusted]) <= consistency.ALIKE * 300).all(axis=2)
+    alike = (np.abs(moved[:, None] - moved[trusted]) <= consistency.SIMILAR * 300).all(axis=2)
     near[trusted, range(3)] = False
-    assert consistency.supported(first, second, trusted, 300).tolist() == np.flatnonzero((near & alike).any(axis=1)).tolist()
+    assert consistency.find_supported(first, second, trusted, 300).tolist() == np.flatnonzero((near & alike).any(axis=1)).tolist()
 
 
 def test_true_matches_are_found_among_accidents(keypoints: list[np.ndarray], matches: dict[Pair, Indices]) -> None:
     rows = matches[2, 3]
     assert is_true(rows).mean() < 0.05
-    left = consistency.consistent(
+    left = consistency.select_consistent(
         keypoints[2][rows[:, 0]].astype(float), keypoints[3][rows[:, 1]].astype(float), 640, 80, np.random.default_rng(0)
     )
     assert is_true(rows[left]).sum() > 0.8 * is_true(rows).sum()
@@ -111,12 +113,12 @@ def test_true_matches_are_found_among_accidents(keypoints: list[np.ndarray], mat
 def test_clean_matches_are_left_alone(keypoints: list[np.ndarray]) -> None:
     every = np.arange(POINTS)
     first, second = (keypoints[image].astype(float) for image in (2, 3))
-    assert consistency.consistent(first, second, 640, 80, np.random.default_rng(0)).tolist() == every.tolist()
+    assert consistency.select_consistent(first, second, 640, 80, np.random.default_rng(0)).tolist() == every.tolist()
 
 
 @pytest.fixture(scope="module")
 def geometries(keypoints: list[np.ndarray], matches: dict[Pair, Indices]) -> dict[Pair, verification.Geometry]:
-    return verification.verified(CAMERA, keypoints, matches, 0)
+    return verification.verify_pairs(CAMERA, keypoints, matches, 0)
 
 
 def test_geometry_is_the_true_one(geometries: dict[Pair, verification.Geometry], poses: list[pycolmap.Rigid3d]) -> None:
@@ -131,7 +133,7 @@ def test_geometry_is_the_true_one(geometries: dict[Pair, verification.Geometry],
 def test_threads_and_repetition_change_nothing(
     geometries: dict[Pair, verification.Geometry], keypoints: list[np.ndarray], matches: dict[Pair, Indices]
 ) -> None:
-    alone = verification.verified(CAMERA, keypoints, matches, 0, threads=1)
+    alone = verification.verify_pairs(CAMERA, keypoints, matches, 0, threads=1)
     assert list(alone) == list(geometries)
     for pair, found in alone.items():
         np.testing.assert_array_equal(found.matches, geometries[pair].matches)
@@ -140,26 +142,26 @@ def test_threads_and_repetition_change_nothing(
 
 def test_shuffled_matches_have_no_geometry(keypoints: list[np.ndarray], matches: dict[Pair, Indices]) -> None:
     """Negative control."""
-    found = verification.verified(CAMERA, keypoints, shuffled(matches), 0)
+    found = verification.verify_pairs(CAMERA, keypoints, shuffled(matches), 0)
     assert len(found) <= 2
-    assert incremental_mapping.mapped(CAMERA, keypoints, found, "global", 0) is None
+    assert incremental_mapping.build_model(CAMERA, keypoints, found, "global", 0) is None
 
 
 @pytest.mark.parametrize("mapper", ["global", "incremental"])
 def test_the_mapped_cameras_are_the_true_ones(
     mapper: Mapper, geometries: dict[Pair, verification.Geometry], keypoints: list[np.ndarray], poses: list[pycolmap.Rigid3d]
 ) -> None:
-    model = incremental_mapping.mapped(CAMERA, keypoints, geometries, mapper, 0)
-    again = incremental_mapping.mapped(CAMERA, keypoints, geometries, mapper, 0)
+    model = incremental_mapping.build_model(CAMERA, keypoints, geometries, mapper, 0)
+    again = incremental_mapping.build_model(CAMERA, keypoints, geometries, mapper, 0)
     assert model is not None
     assert again is not None
-    assert len(model.images) == VIEWS == agreement.right(model, poses)
+    assert len(model.images) == VIEWS == agreement.count_correct_poses(model, poses)
     assert len(model.points) > 60
     assert model.reprojection_error < 1
     np.testing.assert_array_equal(model.points, again.points)
     np.testing.assert_array_equal(model.centres, again.centres)
     mirrored = [pycolmap.Rigid3d(pose.rotation.inverse(), pose.translation * [-1, 1, 1]) for pose in poses]
-    assert agreement.right(model, mirrored) < 3  # other cameras are not taken for these
+    assert agreement.count_correct_poses(model, mirrored) < 3  # other cameras are not taken for these
 
 
 def model(poses: list[pycolmap.Rigid3d]) -> Model:
@@ -170,23 +172,23 @@ def model(poses: list[pycolmap.Rigid3d]) -> Model:
 def test_agreement_is_up_to_a_similarity(poses: list[pycolmap.Rigid3d]) -> None:
     moved = pycolmap.Sim3d(3.0, pycolmap.Rotation3d(Rotation.from_euler("xyz", [1, 2, 3]).as_quat()), [5, -2, 9])
     found = [moved.transform_camera_world(pose) for pose in poses]
-    assert agreement.right(model(found), poses) == VIEWS
+    assert agreement.count_correct_poses(model(found), poses) == VIEWS
     turned = pycolmap.Rigid3d(pycolmap.Rotation3d(Rotation.from_euler("z", 0.2).as_quat()), [0, 0, 0])
     found[0] = turned * found[0]  # in its place, but it looks elsewhere
     found[4] = pycolmap.Rigid3d(found[4].rotation, found[4].translation + 6)
-    assert agreement.right(model(found), poses) == VIEWS - 2
+    assert agreement.count_correct_poses(model(found), poses) == VIEWS - 2
 
 
 def test_measures(poses: list[pycolmap.Rigid3d]) -> None:
-    found = measured(model(poses), poses)
+    found = compute_metrics(model(poses), poses)
     assert found == {"registered": 5, "points": 50, "track_length": 3, "reprojection_error": 0.5, "right_poses": 5}
-    assert measured(model(poses), [*poses[:4], None])["right_poses"] is None
+    assert compute_metrics(model(poses), [*poses[:4], None])["right_poses"] is None
     nothing = {"registered": 0, "points": 0, "track_length": None, "reprojection_error": None, "right_poses": 0}
-    assert measured(None, poses) == nothing
+    assert compute_metrics(None, poses) == nothing
 
 
 def test_picture_shows_points_and_cameras(poses: list[pycolmap.Rigid3d]) -> None:
-    shown = picture.from_above(model(poses))
+    shown = picture.draw_from_above(model(poses))
     assert shown.shape == (picture.SIDE, picture.SIDE, 3)
     assert shown.dtype == np.float32
     assert 0 <= shown.min() < shown.max() <= 1
@@ -197,10 +199,10 @@ def test_picture_shows_points_and_cameras(poses: list[pycolmap.Rigid3d]) -> None
 
 def judged(defense: Defense, poses: list[pycolmap.Rigid3d], keypoints: list[np.ndarray], strangers: bool = False) -> Outcome:
     """What the task says of images whose keypoint i has the same descriptor in all, or in none."""
-    made = trial(defense, example_features(POINTS))
+    made = build_trial(defense, draw_features(POINTS))
     shots = []
     for number, each in enumerate(keypoints):
-        secret: Features = replace(example_features(POINTS, seed=number * strangers), keypoints=each, size=(640, 480))
+        secret: Features = replace(draw_features(POINTS, seed=number * strangers), keypoints=each, size=(640, 480))
         shots.append(shot(secret, defense.protect(secret, Public(), np.random.default_rng(number))))
     nowhere = File(path=Path("none"), size=(640, 480))
     images = [
@@ -212,7 +214,7 @@ def judged(defense: Defense, poses: list[pycolmap.Rigid3d], keypoints: list[np.n
 
 @pytest.fixture
 def words(tmp_path: Path) -> Asset:
-    return small_dictionary(tmp_path, 20_000)
+    return write_dictionary(tmp_path, 20_000)
 
 
 @pytest.mark.parametrize("name", ["none", "ldp", "affine"])
@@ -263,7 +265,7 @@ class Fixed(Dataset):
     def __init__(self, there: Scene) -> None:
         self.there = there
 
-    def scene(self) -> Scene:
+    def write_scene(self) -> Scene:
         return self.there
 
 
@@ -277,6 +279,6 @@ def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="takes no images"):
         Structure().collect(tmp_path, None)
     with pytest.raises(UserError, match="2 queries, of which nothing can be rebuilt"):
-        Structure().collect(None, Fixed(scene(tmp_path, queries=2)))
+        Structure().collect(None, Fixed(write_scene(tmp_path, queries=2)))
     with pytest.raises(UserError, match="are of different cameras"):
         Structure().collect(None, Gallery(views=2, queries=12, rooms=1, detail=0.1))

@@ -1,4 +1,4 @@
-"""What tools/compare_defenses.py compares can be compared, and its verdicts say what the intervals do."""
+"""The rows of tools/compare_defenses.py are comparable, and its verdicts follow from the intervals."""
 
 import compare_defenses
 import pytest
@@ -7,20 +7,20 @@ from bench.registry import discovery, spec
 from leaderboard.intervals import Interval
 
 
-def test_each_row_is_served_by_the_network_of_its_defense() -> None:
-    rows = compare_defenses.rows()
+def test_each_row_is_supported_by_the_network_of_its_defense() -> None:
+    rows = compare_defenses.list_rows()
     assert len({text for _, _, text in rows}) == len(rows)
-    assert {name.partition(":")[0] for _, name, _ in rows} == compare_defenses.SERVED.keys()
+    assert {name.partition(":")[0] for _, name, _ in rows} == compare_defenses.SUPPORTED.keys()
     for _, name, text in rows:
         defense = spec.read(text, discovery.DEFENSE)
-        for field, setting in compare_defenses.SERVED[name.partition(":")[0]].items():
+        for field, setting in compare_defenses.SUPPORTED[name.partition(":")[0]].items():
             assert getattr(defense, field) in setting
     bases = [epsilon for epsilon, name, _ in rows if name == compare_defenses.BASE]
     assert {epsilon for epsilon, name, _ in rows if not name.startswith("metric-ldp")} == set(bases)
 
 
 @pytest.mark.parametrize(
-    ("seen", "gained", "told"),
+    ("ssim", "recall", "expected"),
     [
         ((-0.1, -0.01), (1.0, 9.0), "**dominates**"),
         ((-0.1, 0.01), (1.0, 9.0), "server does more, attacker cannot be told"),
@@ -31,10 +31,10 @@ def test_each_row_is_served_by_the_network_of_its_defense() -> None:
         ((-0.2, 0.1), (-9.0, 1.0), "cannot be told"),
     ],
 )
-def test_verdicts(seen: tuple[float, float], gained: tuple[float, float], told: str) -> None:
-    assert compare_defenses.verdict(*(Interval(sum(ends) / 2, *ends, 10) for ends in (seen, gained))) == told
-    dominating = "Dominating" in compare_defenses.summary([("`one`", "cannot be told"), ("`other`", told)])
-    assert dominating == (told == compare_defenses.DOMINATES)
-    assert ("higher, beyond chance, for `other`" in compare_defenses.summary([("`other`", told)])) == (
-        "server does more" in told and not dominating
+def test_verdicts(ssim: tuple[float, float], recall: tuple[float, float], expected: str) -> None:
+    assert compare_defenses.describe_verdict(*(Interval(sum(ends) / 2, *ends, 10) for ends in (ssim, recall))) == expected
+    dominating = "Dominating" in compare_defenses.write_summary([("`one`", "cannot be told"), ("`other`", expected)])
+    assert dominating == (expected == compare_defenses.DOMINATES)
+    assert ("higher, beyond chance, for `other`" in compare_defenses.write_summary([("`other`", expected)])) == (
+        "server does more" in expected and not dominating
     )

@@ -1,5 +1,5 @@
-"""The commands of `bench`, one file each, found by their files' names.
+"""The commands of `bench`, one file each, found by file name.
 
-A command's module has SUMMARY, EPILOG where there are examples to show, REQUIRED (the options that must be given), `options`,
-which declares its options, and `execute`, which does it and returns the exit status. Heavy libraries are imported by `execute`.
+A command has SUMMARY, optionally EPILOG (examples), REQUIRED (names of required options), `add_options`, and `execute`, which
+returns the exit status. `execute` imports heavy libraries.
 """

@@ -1,21 +1,27 @@
-"""`bench audit`: a bound of a defense's epsilon from below, by what it releases."""
+"""`bench audit`: a lower bound of a defense's epsilon, from its releases."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 
-from bench.cli.terminal import DONE, FAILED, add_seed, print_rich, whole
+from bench.cli.terminal import DONE, FAILED, add_seed, parse_whole, print_rich
 
-SUMMARY = "bound a defense's epsilon from below by what it releases; exit status 1 if it is violated"
+SUMMARY = "estimate a lower bound of a defense's epsilon from its releases; exit status 1 if the claim is violated"
 REQUIRED = ("defense",)
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--defense", metavar="SPEC", help="one that claims an epsilon")
-    parser.add_argument("--words", type=whole, metavar="K", help="of a made-up dictionary to report from (default: its own)")
+def add_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--defense", metavar="SPEC", help="a defense that claims an epsilon")
     parser.add_argument(
-        "--trials", type=whole, default=100_000, metavar="N", help="releases of each of two descriptors (default: %(default)s)"
+        "--words", type=parse_whole, metavar="K", help="words of a synthetic dictionary (default: the defense's own dictionary)"
+    )
+    parser.add_argument(
+        "--trials",
+        type=parse_whole,
+        default=100_000,
+        metavar="N",
+        help="releases of each of the two descriptors (default: %(default)s)",
     )
     add_seed(parser)
 
@@ -28,6 +34,6 @@ def execute(args: argparse.Namespace) -> int:
     from bench.registry import discovery, spec
 
     with tempfile.TemporaryDirectory() as folder:
-        found = audit(spec.read(args.defense, discovery.DEFENSE), args.words, args.trials, args.seed, Path(folder))
-    print_rich(*tables.report(found, args.defense))
-    return FAILED if found.verdict == "violated" else DONE
+        result = audit(spec.read(args.defense, discovery.DEFENSE), args.words, args.trials, args.seed, Path(folder))
+    print_rich(*tables.report(result, args.defense))
+    return FAILED if result.verdict == "violated" else DONE

@@ -1,18 +1,19 @@
-"""`bench cache`: what is kept so that it need not be made again."""
+"""`bench cache`: list, verify or prune the cache."""
 
 from __future__ import annotations
 
 import argparse
 from typing import TYPE_CHECKING
 
-from bench.cli.terminal import DONE, FAILED, number, print_rich, size, told_size
+from bench.cli.terminal import DONE, FAILED, format_size, parse_number, parse_size, print_rich
 from bench.core.errors import UserError, unknown_name
 
 if TYPE_CHECKING:
     from bench.cache.store import Entry
 
-SUMMARY = "list, verify or prune what is kept so that it need not be made again: bench cache list"
-EPILOG = """All of it can be made again. It lies in runs/cache, or where the environment's FEATURE_PRIVACY_CACHE says.
+SUMMARY = "list, verify or prune the cache: bench cache list"
+EPILOG = """Every entry can be computed again. The cache is in the platform's folder for caches
+(on Linux ~/.cache/feature-privacy-bench), or in the folder that the environment variable FEATURE_PRIVACY_CACHE names.
 
 examples:
   bench cache list
@@ -25,95 +26,95 @@ ACTIONS = ("list", "verify", "prune")
 DAY = 24 * 3600.0
 
 
-def options(parser: argparse.ArgumentParser) -> None:
+def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "what", nargs="?", metavar="list|verify|prune", help="show it, check every checksum, or remove some of it"
+        "what", nargs="?", metavar="list|verify|prune", help="list entries, check all checksums, or remove entries"
     )
-    parser.add_argument("--kind", metavar="KIND", help="only this kind, such as features")
-    parser.add_argument("--older-than", type=number, metavar="DAYS", help="only what was not used for so long")
-    parser.add_argument("--larger-than", type=size, metavar="SIZE", help="only what is larger, such as 20MB")
-    parser.add_argument("--damaged", action="store_true", help="only what is damaged, or was never finished")
+    parser.add_argument("--kind", metavar="KIND", help="only entries of this kind, such as features")
+    parser.add_argument("--older-than", type=parse_number, metavar="DAYS", help="only entries that were not used for so long")
+    parser.add_argument("--larger-than", type=parse_size, metavar="SIZE", help="only larger entries; a size such as 20MB")
+    parser.add_argument("--damaged", action="store_true", help="only damaged or unfinished entries")
 
 
 def execute(args: argparse.Namespace) -> int:
     if args.what not in ACTIONS:
         raise (
-            UserError(f"say what to do: bench cache {'|'.join(ACTIONS)}")
+            UserError(f"give an action: bench cache {'|'.join(ACTIONS)}")
             if args.what is None
             else unknown_name("command", f"cache {args.what}", [f"cache {action}" for action in ACTIONS])
         )
-    chosen = _chosen(args)
+    entries = _select(args)
     if args.what == "list":
-        _list(chosen)
+        _list(entries)
         return DONE
     if args.what == "verify":
-        return _verify(chosen)
-    return _prune(args, chosen)
+        return _verify(entries)
+    return _prune(args, entries)
 
 
-def _chosen(args: argparse.Namespace) -> list[Entry]:
-    """What the options say."""
+def _select(args: argparse.Namespace) -> list[Entry]:
+    """Return the entries that the options select."""
     import time
 
     from bench.cache import store
 
-    found = list(store.entries())
-    kinds = {entry.kind for entry in found}
+    entries = list(store.list_entries())
+    kinds = {entry.kind for entry in entries}
     if args.kind is not None and args.kind not in kinds:
         raise unknown_name("kind", args.kind, kinds)
     now = time.time()
     return [
         entry
-        for entry in found
+        for entry in entries
         if args.kind in (None, entry.kind)
         and (args.older_than is None or now - entry.used > args.older_than * DAY)
         and (args.larger_than is None or entry.size > args.larger_than)
-        and (not args.damaged or entry.fault() is not None)
+        and (not args.damaged or entry.find_fault() is not None)
     ]
 
 
-def _list(chosen: list[Entry]) -> None:
+def _list(entries: list[Entry]) -> None:
     from datetime import datetime
 
     from rich.table import Table
 
     from bench.cache import store
 
-    table = Table(title=f"{store.root()}: {len(chosen)} entries, {_total(chosen)}", title_justify="left")
+    table = Table(title=f"{store.cache_folder()}: {len(entries)} entries, {_format_total(entries)}", title_justify="left")
     for column in ("kind", "entries", "size", "last used"):
         table.add_column(column, justify="left" if column == "kind" else "right")
-    for kind in sorted({entry.kind for entry in chosen}):
-        its = [entry for entry in chosen if entry.kind == kind]
-        last = datetime.fromtimestamp(max(entry.used for entry in its))
-        table.add_row(kind, str(len(its)), _total(its), f"{last:%Y-%m-%d %H:%M}")
+    for kind in sorted({entry.kind for entry in entries}):
+        of_kind = [entry for entry in entries if entry.kind == kind]
+        last = datetime.fromtimestamp(max(entry.used for entry in of_kind))
+        table.add_row(kind, str(len(of_kind)), _format_total(of_kind), f"{last:%Y-%m-%d %H:%M}")
     print_rich(table)
 
 
-def _verify(chosen: list[Entry]) -> int:
+def _verify(entries: list[Entry]) -> int:
     from bench.core.progress import Progress
 
     faults = []
-    with Progress("verifying", len(chosen)) as progress:
-        for entry in chosen:
-            fault = entry.fault()
+    with Progress("verifying", len(entries)) as progress:
+        for entry in entries:
+            fault = entry.find_fault()
             if fault is not None:
                 faults.append(fault)
             progress.advance(note=entry.kind)
     for fault in faults:
         print(fault)
-    told = "bench cache prune --damaged removes what is" if faults else "all as written"
-    print(f"{len(chosen)} entries, {_total(chosen)}: {len(faults)} damaged; {told}")
+    advice = "remove them with bench cache prune --damaged" if faults else "all checksums are right"
+    print(f"{len(entries)} entries, {_format_total(entries)}: {len(faults)} damaged; {advice}")
     return FAILED if faults else DONE
 
 
-def _prune(args: argparse.Namespace, chosen: list[Entry]) -> int:
+def _prune(args: argparse.Namespace, entries: list[Entry]) -> int:
     if not args.damaged and all(value is None for value in (args.kind, args.older_than, args.larger_than)):
-        raise UserError("say what to remove: --kind, --older-than, --larger-than or --damaged (--older-than 0 is everything)")
-    for entry in chosen:
+        raise UserError("give what to remove: --kind, --older-than, --larger-than or --damaged (--older-than 0 removes all)")
+    for entry in entries:
         entry.remove()
-    print(f"removed {len(chosen)} entries and freed {_total(chosen)}")
+    print(f"removed {len(entries)} entries and freed {_format_total(entries)}")
     return DONE
 
 
-def _total(chosen: list[Entry]) -> str:
-    return told_size(sum(entry.size for entry in chosen))
+def _format_total(entries: list[Entry]) -> str:
+    return format_size(sum(entry.size for entry in entries))

@@ -1,38 +1,46 @@
-"""`bench scale`: what a service costs."""
+"""`bench cost`: the cost of a service."""
 
 from __future__ import annotations
 
 import argparse
 import sys
 
-from bench.cli.terminal import DONE, print_rich, whole
+from bench.cli.terminal import DONE, parse_whole, print_rich
 
-SUMMARY = "measure this machine, and say what a service costs: operations, bytes and time of a query, and of a day's"
-EPILOG = """Times are of one core; those of a phone's differ. `bench scale` takes some seconds to measure.
+SUMMARY = "measure this machine and estimate the cost of a service: operations, bytes and time, per query and per day"
+EPILOG = """Times are those of one core of this machine; a phone differs. The measurement takes some seconds.
 
 examples:
-  bench scale
-  bench scale --queries 1000000 --keypoints 2000 --words 32000
+  bench cost
+  bench cost --queries 1000000 --keypoints 2000 --words 32000
 """
 REQUIRED = ()
 COLUMNS = ("who", "step", "operations", "bytes", "core seconds", "TB a day", "cores")
 
 
-def options(parser: argparse.ArgumentParser) -> None:
+def add_options(parser: argparse.ArgumentParser) -> None:
     from bench.core.errors import UserError
 
-    def positive(text: str) -> int:
-        if (found := whole(text)) < 1:
+    def parse_positive(text: str) -> int:
+        if (number := parse_whole(text)) < 1:
             raise UserError(f"{text} must be at least 1")
-        return found
+        return number
 
-    parser.add_argument("--queries", type=positive, default=1_000_000, metavar="N", help="a day (default: %(default)s)")
-    parser.add_argument("--keypoints", type=positive, default=1000, metavar="N", help="of a photograph (default: %(default)s)")
-    parser.add_argument("--words", type=positive, default=256_000, metavar="K", help="of the dictionary (default: %(default)s)")
     parser.add_argument(
-        "--subset-size", type=positive, default=2, metavar="M", help="words sent a keypoint (default: %(default)s)"
+        "--queries", type=parse_positive, default=1_000_000, metavar="N", help="queries per day (default: %(default)s)"
     )
-    parser.add_argument("--references", type=positive, default=20, metavar="R", help="images to match (default: %(default)s)")
+    parser.add_argument(
+        "--keypoints", type=parse_positive, default=1000, metavar="N", help="keypoints of a photograph (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--words", type=parse_positive, default=256_000, metavar="K", help="words of the dictionary (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--subset-size", type=parse_positive, default=2, metavar="M", help="words sent for each keypoint (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--references", type=parse_positive, default=20, metavar="R", help="reference images to match (default: %(default)s)"
+    )
     parser.add_argument("--markdown", action="store_true", help="print the table as Markdown")
 
 
@@ -43,7 +51,7 @@ def execute(args: argparse.Namespace) -> int:
     from leaderboard.tables import markdown_row
 
     service = cost.Service(keypoints=args.keypoints, words=args.words, subset_size=args.subset_size, references=args.references)
-    rows = cost.rows(service, cost.measure(service), args.queries)
+    rows = cost.rows(service, cost.measure_rates(service), args.queries)
     if args.markdown:
         lines = [markdown_row(COLUMNS), markdown_row("---" for _ in COLUMNS), *map(markdown_row, rows)]
         sys.stdout.write("\n".join(lines) + "\n")

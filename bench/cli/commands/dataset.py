@@ -1,23 +1,23 @@
-"""`bench dataset`: a dataset in a folder."""
+"""`bench dataset`: write a dataset into a folder."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 
-from bench.cli.terminal import DONE, whole
+from bench.cli.terminal import DONE, parse_whole
 
-SUMMARY = "write a dataset, such as the gallery, into a folder that other programs can read"
+SUMMARY = "write a dataset, such as the gallery, into a folder for other programs"
 REQUIRED = ("dataset", "layout", "out")
 
 
-def options(parser: argparse.ArgumentParser) -> None:
+def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("dataset", nargs="?", metavar="SPEC", help="name:field=value,... (bench list datasets)")
-    parser.add_argument("--layout", metavar="aachen|colmap", help="how the folder is laid out")
+    parser.add_argument("--layout", metavar="aachen|colmap", help="the layout of the folder")
     parser.add_argument("--out", type=Path, metavar="DIR", help="a new folder")
-    parser.add_argument("--views", type=whole, metavar="N", help="reference images; short for the field of that name")
-    parser.add_argument("--queries", type=whole, metavar="N", help="queries; likewise")
-    parser.add_argument("--seed", type=whole, metavar="N", help="of everything random; likewise")
+    parser.add_argument("--views", type=parse_whole, metavar="N", help="number of reference images; sets the field of that name")
+    parser.add_argument("--queries", type=parse_whole, metavar="N", help="number of queries; likewise")
+    parser.add_argument("--seed", type=parse_whole, metavar="N", help="seed; likewise")
 
 
 def execute(args: argparse.Namespace) -> int:

@@ -1,22 +1,22 @@
-"""`bench dictionary build`: dictionaries of descriptors."""
+"""`bench dictionary build`: build a dictionary of descriptors."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 
-from bench.cli.terminal import DONE, add_extractor, add_seed, require, whole
+from bench.cli.terminal import DONE, add_extractor, add_seed, parse_whole, require
 from bench.core.errors import UserError, unknown_name
 
-SUMMARY = "make dictionaries of descriptors: bench dictionary build"
+SUMMARY = "build a dictionary of descriptors: bench dictionary build"
 REQUIRED = ()
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("what", nargs="?", type=_what, metavar="build", help="cluster the descriptors of a folder")
+def add_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("what", nargs="?", type=_parse_action, metavar="build", help="cluster the descriptors of a folder")
     parser.add_argument("--images", type=Path, metavar="DIR", help="a folder of photographs")
-    parser.add_argument("--size", type=whole, metavar="K", help="the number of words")
-    parser.add_argument("--out", type=Path, metavar="FILE", help="the dictionary, a safetensors file")
+    parser.add_argument("--size", type=parse_whole, metavar="K", help="number of words")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="a new safetensors file")
     add_seed(parser, "the clustering")
     add_extractor(parser)
 
@@ -26,7 +26,7 @@ def execute(args: argparse.Namespace) -> int:
     from bench.registry import discovery, spec
 
     if args.what is None:
-        raise UserError("say what to do with a dictionary: bench dictionary build")
+        raise UserError("give an action: bench dictionary build")
     require(args, ("images", "size", "out"), "dictionary build")
 
     built = build(args.images, args.size, args.out, spec.read(args.extractor, discovery.EXTRACTOR), args.seed)
@@ -35,7 +35,7 @@ def execute(args: argparse.Namespace) -> int:
     return DONE
 
 
-def _what(text: str) -> str:
+def _parse_action(text: str) -> str:
     if text != "build":
         raise unknown_name("command", f"dictionary {text}", ["dictionary build"])
     return text

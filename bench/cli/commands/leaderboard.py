@@ -1,28 +1,37 @@
-"""`bench leaderboard`: tables, plots and a page, from records alone."""
+"""`bench leaderboard`: write tables, plots and a page from records."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 
-from bench.cli.terminal import DONE, say
+from bench.cli.terminal import DONE, print_status
 
-SUMMARY = "make tables, plots and a page that needs no network from the records of any number of runs"
-EPILOG = """The page is OUT/index.html; beside it lie tables/ (Markdown, CSV, LaTeX), plots/ (PNG, PDF) and pictures/.
+SUMMARY = "write tables, plots and an offline page from the records of any number of runs"
+EPILOG = """The page is OUT/index.html, with the folders tables/ (Markdown, CSV, LaTeX), plots/ (PNG, PDF) and pictures/.
 
 examples:
   bench leaderboard --results runs/ --out site/
+  bench leaderboard --results runs/a runs/b --out site/
 """
 REQUIRED = ("results", "out")
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--results", type=Path, metavar="DIR", help="of bench run; all records below it are taken")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="what is written; over what was written there before")
+def add_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--results",
+        type=Path,
+        nargs="+",
+        action="extend",
+        metavar="DIR",
+        help="folders of bench run, with all records below them, or files of records; may be repeated",
+    )
+    parser.add_argument("--out", type=Path, metavar="DIR", help="the folder to write; earlier output is overwritten")
 
 
 def execute(args: argparse.Namespace) -> int:
     from leaderboard import site
 
-    done = site.write(args.results, args.out)
-    return say(DONE, f"written to {done.page} (boards: {done.boards}, cells: {done.cells}, records: {done.records})")
+    written = site.write(args.results, args.out)
+    counts = f"comparison groups: {written.groups}, experiments: {written.experiments}, records: {written.records}"
+    return print_status(DONE, f"written to {written.page} ({counts})")

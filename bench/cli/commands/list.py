@@ -1,4 +1,4 @@
-"""`bench list`: what there is."""
+"""`bench list`: list plugins."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ SUMMARY = "list plugins with their fields, and which attack applies to which def
 REQUIRED = ()
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("what", nargs="?", metavar="defenses|attacks|metrics|tasks|extractors")
+def add_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("section", nargs="?", metavar="defenses|attacks|metrics|tasks|datasets|extractors")
 
 
 def execute(args: argparse.Namespace) -> int:
-    from bench.cli.listing import SECTIONS, listing
+    from bench.cli.listing import SECTIONS, build_listing
 
-    if args.what is not None and args.what not in SECTIONS:
-        raise unknown_name("list", args.what, SECTIONS)
-    print_rich(*listing(args.what))
+    if args.section is not None and args.section not in SECTIONS:
+        raise unknown_name("list", args.section, SECTIONS)
+    print_rich(*build_listing(args.section))
     return DONE

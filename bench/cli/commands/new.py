@@ -1,4 +1,4 @@
-"""`bench new`: a plugin of one's own."""
+"""`bench new`: write a package with a new plugin."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from pathlib import Path
 
 from bench.cli.terminal import DONE
 
-SUMMARY = "write a small package with a plugin of your own and a passing test of the contract that it must keep"
-EPILOG = """What is written works, does little, and is yours to change.
+SUMMARY = "write a small package with a new plugin and a passing test of its contract"
+EPILOG = """The package works as written. Change it to your needs.
 
 examples:
   bench new defense my-defense
@@ -18,10 +18,10 @@ examples:
 REQUIRED = ("kind", "name")
 
 
-def options(parser: argparse.ArgumentParser) -> None:
+def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("kind", nargs="?", metavar="KIND", help="defense, attack, metric, task, extractor or dataset")
     parser.add_argument("name", nargs="?", metavar="NAME", help="small letters, digits and -")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="a new folder (default: called as the plugin)")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="a new folder (default: the name of the plugin)")
 
 
 def execute(args: argparse.Namespace) -> int:

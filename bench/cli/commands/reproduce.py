@@ -1,14 +1,14 @@
-"""`bench reproduce`: the paper's tables and figures beside ours."""
+"""`bench reproduce`: the paper's tables and figures beside our results."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 
-from bench.cli.terminal import DONE, FAILED, add_extractor, add_seed, print_rich, say, whole
+from bench.cli.terminal import DONE, FAILED, add_extractor, add_seed, parse_whole, print_rich, print_status
 
-SUMMARY = "rebuild a table of the paper, or its figures, beside the paper's"
-EPILOG = """Tables come with intervals over the photographs, and with a verdict on each claim of the paper.
+SUMMARY = "reproduce a table of the paper, or its figures, beside the published values"
+EPILOG = """Tables have intervals over the photographs, and a verdict on each claim of the paper.
 
 examples:
   bench reproduce table1
@@ -19,23 +19,25 @@ examples:
 REQUIRED = ("what",)
 
 
-def options(parser: argparse.ArgumentParser) -> None:
+def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("what", nargs="?", metavar="NAME", help="table1, table2, tableS2, figures, ...")
-    parser.add_argument("--profile", metavar="NAME", default="cpu", help="smoke, cpu or paper: the sizes (default: %(default)s)")
+    parser.add_argument(
+        "--profile", metavar="NAME", default="cpu", help="smoke, cpu or paper: the size of the experiment (default: %(default)s)"
+    )
     parser.add_argument("--images", type=Path, metavar="DIR", help="a folder of photographs (default: the built-in ones)")
-    parser.add_argument("--dataset", metavar="SPEC", help="the place that a table is about (default: a gallery)")
-    parser.add_argument("--workers", type=whole, metavar="N", help="processes, for such tables (default: one a core)")
+    parser.add_argument("--dataset", metavar="SPEC", help="the scene of a table about localization (default: a gallery)")
+    parser.add_argument("--workers", type=parse_whole, metavar="N", help="processes, for such tables (default: one per core)")
     add_extractor(parser, None, "the table's own")
     add_seed(parser)
     parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="folder for the results; resumed if it exists (default: in runs/)"
+        "--out", type=Path, metavar="DIR", help="folder for the results; resumed if it exists (default: a folder in runs/)"
     )
     parser.add_argument("--dictionary", metavar="FILE", help="K of LDP-Feat (default: the shipped one)")
     parser.add_argument("--database", metavar="FILE", help="W of affine lifting (default: the shipped one)")
-    parser.add_argument("--public-database", metavar="FILE", help="Z, the attacker's own (default: the shipped one)")
+    parser.add_argument("--public-database", metavar="FILE", help="the attacker's Z (default: the shipped one)")
     for network, defense in (("raw", "none"), ("affine", "affine"), ("ldp", "ldp")):
         parser.add_argument(
-            f"--{network}-network", metavar="FILE", help=f"weights trained for `{defense}` (default: shipped ones)"
+            f"--{network}-network", metavar="FILE", help=f"weights trained for `{defense}` (default: the shipped ones)"
         )
 
 
@@ -43,7 +45,7 @@ def execute(args: argparse.Namespace) -> int:
     from bench.registry import discovery, spec
     from leaderboard import reproduce
 
-    materials = {name: getattr(args, name) for name in reproduce.materials() if getattr(args, name)}
+    materials = {name: getattr(args, name) for name in reproduce.list_materials() if getattr(args, name)}
     done = reproduce.reproduce(
         args.what,
         args.profile,
@@ -55,6 +57,6 @@ def execute(args: argparse.Namespace) -> int:
         workers=args.workers,
         materials=materials,
     )
-    print_rich(*done.shown)
-    say(DONE, f"written to {done.out}")
+    print_rich(*done.output)
+    print_status(DONE, f"written to {done.out}")
     return FAILED if done.failed else DONE

@@ -1,4 +1,4 @@
-"""`bench run`: defenses against attacks, or judged for what a server can do with them."""
+"""`bench run`: evaluate defenses against attacks, or by a task of the server."""
 
 from __future__ import annotations
 
@@ -7,17 +7,18 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bench.cli.terminal import DONE, FAILED, add_engine, add_extractor, add_seed, say
+from bench.cli.terminal import DONE, FAILED, add_engine, add_extractor, add_seed, print_status
 from bench.core.errors import UserError
 
 if TYPE_CHECKING:
-    from bench.api import Defense, Metric, Task
+    from bench.api import Defense, Metric
     from bench.runner.plan import Plan
     from bench.runner.records import Record
+    from bench.task_api import Task
 
-SUMMARY = "run defenses against attacks on photographs, and report what was recovered"
-EPILOG = """A plugin is written name:field=value,field=value; `bench list` shows names and fields.
-Repeated options make a grid.
+SUMMARY = "run defenses against attacks on photographs, and report how much is recovered"
+EPILOG = """Write a plugin as name:field=value,field=value; `bench list` shows names and fields.
+Repeated options form a grid.
 
 examples:
   bench run --defense ldp --attack dia
@@ -26,28 +27,28 @@ examples:
 REQUIRED = ("defense",)
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--defense", action="append", metavar="SPEC", help="what protects the features; may be repeated")
-    parser.add_argument("--attack", action="append", metavar="SPEC", help="who tries to undo it; may be repeated")
+def add_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--defense", action="append", metavar="SPEC", help="a defense; may be repeated")
+    parser.add_argument("--attack", action="append", metavar="SPEC", help="an attack; may be repeated")
     parser.add_argument(
-        "--task", metavar="SPEC", default="reconstruction", help="what a release is judged by (default: %(default)s)"
+        "--task", metavar="SPEC", default="reconstruction", help="the task that evaluates a release (default: %(default)s)"
     )
     parser.add_argument(
         "--metric",
         action="append",
         default=[],
         metavar="SPEC",
-        help="one that must be told a file; all others are measured anyway",
+        help="a metric that needs a file; all others are measured anyway",
     )
     add_extractor(parser)
     parser.add_argument("--images", type=Path, metavar="DIR", help="a folder of photographs (default: seven built-in ones)")
     parser.add_argument(
-        "--dataset", metavar="SPEC", help="the place that a task is about (default: the task's; bench list datasets)"
+        "--dataset", metavar="SPEC", help="the scene of the task (default: that of the task; see bench list datasets)"
     )
     add_engine(parser)
     add_seed(parser)
     parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="folder for the results; resumed if it exists (default: in runs/)"
+        "--out", type=Path, metavar="DIR", help="folder for the results; resumed if it exists (default: a folder in runs/)"
     )
     parser.add_argument("--json", action="store_true", help="print the records instead of the table")
 
@@ -56,42 +57,43 @@ def execute(args: argparse.Namespace) -> int:
     from bench.cli import watch
     from bench.registry import discovery, spec
     from bench.runner import engines
-    from bench.runner import plan as runner
-    from bench.runner.plan import RunConfiguration
+    from bench.runner.plan import RunConfiguration, build_plan, cross
+    from bench.runner.trial import dry_run
     from leaderboard import localization_results, run_report
 
     engine = engines.choose_engine(args.workers, args.engine, args.scheduler)
     task = spec.read(args.task, discovery.TASK)
     _check_attacks(task, args.attack)
-    defenses = [_defense(text, task) for text in args.defense]
+    defenses = [_read_defense(text, task) for text in args.defense]
     attacks = [spec.read(text, discovery.ATTACK) for text in args.attack or []]
-    asked = RunConfiguration(
-        pairs=runner.cross(task, defenses, attacks),
+    configuration = RunConfiguration(
+        pairs=cross(task, defenses, attacks),
         images=args.images,
         task=task,
         extractor=spec.read(args.extractor, discovery.EXTRACTOR),
         dataset=None if args.dataset is None else spec.read(args.dataset, discovery.DATASET),
         seed=args.seed,
-        metrics=tuple(_metric(text) for text in args.metric),
+        metrics=tuple(_read_metric(text) for text in args.metric),
     )
-    plan = runner.prepared(asked, engine.describe)
+    plan = build_plan(configuration, engine.describe)
+    dry_run(plan)
     out = args.out or Path("runs") / _run_name(plan)
     records = watch.execute_with_progress(
-        [plan], out, engine, f"{task.name()}: {len(plan.samples)} units, {len(plan.experiments)} pairs"
+        [plan], out, engine, f"{task.name()}: {len(plan.samples)} samples, {len(plan.experiments)} pairs"
     )
     run_report.write(records, plan.samples, out)
     _print_records(records) if args.json else watch.print_tables(records)
     for line in localization_results.write(records, out):
-        say(DONE, line)
-    say(DONE, f"written to {out}")
+        print_status(DONE, line)
+    print_status(DONE, f"written to {out}")
     return FAILED if any(record["status"] == "failed" for record in records) else DONE
 
 
-def _defense(text: str, task: Task) -> Defense:
-    """A defense as it is written. Its words are those of the place, if there is one and no others are named."""
-    from bench.api import Asset
+def _read_defense(text: str, task: Task) -> Defense:
+    """Build a defense from text. Its default dictionary is that of the scene, if the task has one."""
     from bench.codebook.public import REFERENCES
     from bench.registry import discovery, spec
+    from bench.settings import Asset
 
     plugin, given = spec.parse(text, discovery.DEFENSE)
     if task.needs_scene and plugin.dictionary_field is not None:
@@ -99,26 +101,28 @@ def _defense(text: str, task: Task) -> Defense:
     return spec.build(plugin, given)
 
 
-def _metric(text: str) -> Metric:
+def _read_metric(text: str) -> Metric:
     from bench.registry import discovery, fields, spec
 
     metric = spec.read(text, discovery.METRIC)
-    if not fields.without_default(type(metric)):
-        raise UserError(f"--metric {metric.name()}: it needs not be asked for; all metrics that need no file are measured")
+    if not fields.list_required(type(metric)):
+        raise UserError(f"--metric {metric.name()}: not needed; all metrics that need no file are measured anyway")
     return metric
 
 
 def _check_attacks(task: Task, attacks: list[str] | None) -> None:
     if task.judges_attacks and not attacks:
-        raise UserError(f"--attack is missing: the task {task.name()} judges what an attack recovers (bench list attacks)")
+        raise UserError(f"--attack is missing: the task {task.name()} evaluates an attack (see bench list attacks)")
     if attacks and not task.judges_attacks:
-        raise UserError(f"--attack: the task {task.name()} judges the release itself and takes none")
+        raise UserError(f"--attack: the task {task.name()} evaluates the release itself and takes no attack")
 
 
 def _run_name(plan: Plan) -> str:
-    """The defenses' and attacks' names, and eight digits that tell configurations apart."""
-    defenses = dict.fromkeys(cell.defense.name() for cell in plan.experiments)
-    attacks = dict.fromkeys(cell.attack.name() if cell.attack else plan.task.name() for cell in plan.experiments)
+    """Return the names of defenses and attacks, and eight digits of the configuration's hash."""
+    defenses = dict.fromkeys(experiment.defense.name() for experiment in plan.experiments)
+    attacks = dict.fromkeys(
+        experiment.attack.name() if experiment.attack else plan.task.name() for experiment in plan.experiments
+    )
     return f"{'+'.join(defenses)[:60]}-{'+'.join(attacks)[:60]}-{plan.hash[:8]}"
 
 

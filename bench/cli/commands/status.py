@@ -1,4 +1,4 @@
-"""`bench status`: how far a run or a suite is."""
+"""`bench status`: progress of a run or a suite."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from bench.cli.terminal import DONE, print_rich
 from bench.core.errors import UserError
 
-SUMMARY = "show what of a run or suite is done, running, failed, not applicable or missing"
+SUMMARY = "show how much of a run or suite is done, running, failed, not applicable or missing"
 EPILOG = """examples:
   bench status                      # every run in runs/
   bench status paper-table-1
@@ -17,21 +17,21 @@ EPILOG = """examples:
 REQUIRED = ()
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("suite", nargs="?", metavar="SUITE", help="as bench sweep was given it, if it was given no --out")
-    parser.add_argument("--results", type=Path, metavar="DIR", help="a folder that bench run, sweep or reproduce writes")
+def add_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("suite", nargs="?", metavar="SUITE", help="a suite that bench sweep ran without --out")
+    parser.add_argument("--results", type=Path, metavar="DIR", help="a folder of bench run, sweep or reproduce")
 
 
 def execute(args: argparse.Namespace) -> int:
-    from bench.cli.status import overview_table, status_table
+    from bench.cli.status import build_overview_table, build_status_table
     from bench.runner import suite
 
     if args.suite is not None and args.results is not None:
         raise UserError("give a suite or --results, not both")
     if args.suite is not None:
-        print_rich(*status_table(suite.folder(args.suite)))
+        print_rich(*build_status_table(suite.choose_folder(args.suite)))
     elif args.results is not None:
-        print_rich(*status_table(args.results))
+        print_rich(*build_status_table(args.results))
     else:
-        print_rich(overview_table(Path("runs")))
+        print_rich(build_overview_table(Path("runs")))
     return DONE

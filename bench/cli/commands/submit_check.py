@@ -1,17 +1,17 @@
-"""`bench submit-check`: somebody's records, before they are believed."""
+"""`bench submit-check`: check submitted records."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 
-from bench.cli.terminal import DONE, FAILED, add_seed, say, whole
+from bench.cli.terminal import DONE, FAILED, add_seed, parse_whole, print_status
 
-SUMMARY = "check somebody's records: schema, hashes, ranges, applicability, duplicates; and make a sample of them again"
-EPILOG = """A record is made again with its attack in a process that never holds the secret. It and its plugins must be installed.
-Every complaint is a line on stdout that begins with the line of the file.
+SUMMARY = "check submitted records: schema, hashes, ranges, applicability and duplicates; recompute a sample of them"
+EPILOG = """A record is recomputed with its attack in a process that never holds the secret. Its plugins must be installed.
+Every fault is a line on stdout that begins with the line number in the file.
 
-exit status: 0 nothing is wrong, 1 something is, 2 a mistake in what was asked
+exit status: 0 no fault; 1 a fault; 2 invalid arguments
 
 examples:
   bench submit-check runs/x
@@ -20,9 +20,9 @@ examples:
 REQUIRED = ("records",)
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("records", nargs="?", type=Path, metavar="FILE", help="records, or a folder of bench run's")
-    parser.add_argument("--images", type=Path, metavar="DIR", help="the photographs, if they are not the built-in ones")
+def add_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("records", nargs="?", type=Path, metavar="FILE", help="a file of records, or a folder of bench run")
+    parser.add_argument("--images", type=Path, metavar="DIR", help="the photographs (default: the built-in ones)")
     parser.add_argument(
         "--file",
         type=Path,
@@ -31,7 +31,9 @@ def options(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="a dictionary or network; may be repeated",
     )
-    parser.add_argument("--sample", type=whole, default=3, metavar="N", help="records to make again (default: %(default)s)")
+    parser.add_argument(
+        "--sample", type=parse_whole, default=3, metavar="N", help="number of records to recompute (default: %(default)s)"
+    )
     add_seed(parser, "the sample")
 
 
@@ -40,10 +42,10 @@ def execute(args: argparse.Namespace) -> int:
     from leaderboard import submission
 
     count, faults = submission.check(
-        records.find(args.records), images=args.images, files=args.file, sample=args.sample, seed=args.seed
+        records.find_file(args.records), images=args.images, files=args.file, sample=args.sample, seed=args.seed
     )
-    for line in submission.lines(faults):
+    for line in submission.format_faults(faults):
         print(line)
     if faults:
-        return say(FAILED, f"{len(faults)} faults in {count} records")
-    return say(DONE, f"nothing is wrong with {count} records, of which {min(args.sample, count)} at most were made again")
+        return print_status(FAILED, f"{len(faults)} faults in {count} records")
+    return print_status(DONE, f"no fault in {count} records, of which at most {min(args.sample, count)} were recomputed")

@@ -1,37 +1,46 @@
-"""`bench choose`: how many words to release."""
+"""`bench subset-size`: compare subset sizes."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 
-from bench.cli.terminal import DONE, number, print_rich, whole, wholes
+from bench.cli.terminal import DONE, parse_number, parse_whole, parse_wholes, print_rich
 
-SUMMARY = "say how many words to release for a dictionary and an epsilon: by what they tell, and by what a server can do"
+SUMMARY = "compare subset sizes for a dictionary and an epsilon: information, and success of the server"
 REQUIRED = ("epsilon",)
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--epsilon", type=number, metavar="E", help="of a descriptor")
-    parser.add_argument("--words", type=whole, metavar="K", help="of the dictionary (default: those of the shipped one)")
+def add_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--epsilon", type=parse_number, metavar="E", help="epsilon of a descriptor")
     parser.add_argument(
-        "--sizes", type=wholes, metavar="M,M,...", help="to choose from (default: powers of 2, and the best known)"
+        "--words", type=parse_whole, metavar="K", help="words of the dictionary (default: those of the shipped one)"
     )
-    parser.add_argument("--keypoints", type=whole, default=1000, metavar="N", help="of a query (default: %(default)s)")
+    parser.add_argument(
+        "--sizes",
+        type=parse_wholes,
+        metavar="M,M,...",
+        help="subset sizes to compare (default: powers of 2, and the optima of theory)",
+    )
+    parser.add_argument(
+        "--keypoints", type=parse_whole, default=1000, metavar="N", help="keypoints of a query (default: %(default)s)"
+    )
     parser.add_argument(
         "--repeated",
-        type=number,
+        type=parse_number,
         default=0.27,
-        metavar="SHARE",
-        help="of these, that have their point's word in the retrieved references (default: %(default)s)",
+        metavar="FRACTION",
+        help="fraction of keypoints whose word occurs at their point in the retrieved references (default: %(default)s)",
     )
-    parser.add_argument("--points", type=whole, default=5000, metavar="R", help="of these references (default: %(default)s)")
-    parser.add_argument("--trials", type=whole, default=30_000, metavar="T", help="of RANSAC (default: %(default)s)")
+    parser.add_argument(
+        "--points", type=parse_whole, default=5000, metavar="R", help="points of these references (default: %(default)s)"
+    )
+    parser.add_argument("--trials", type=parse_whole, default=30_000, metavar="T", help="trials of RANSAC (default: %(default)s)")
     parser.add_argument(
         "--results",
         type=Path,
         metavar="DIR",
-        help="of localization: shows what was measured by day, and takes the queries' own shares where nothing was hidden",
+        help="results of localization: shows the recall by day, and uses the measured fractions of undefended queries",
     )
 
 
@@ -45,13 +54,13 @@ def execute(args: argparse.Namespace) -> int:
     recalls: dict[int, list[float]] = {}
     repeated: list[float] = []
     if args.results is not None:
-        found = records.read(records.find(args.results)).records
-        recalls, repeated = subset_size.measured(found, args.epsilon, words, args.trials, "day")
-    known = {1, 2, 4, 8, 16, most_accurate_size(args.epsilon, words), most_informative_size(args.epsilon, words)}
-    sizes = args.sizes or sorted(size for size in known if size < words)
-    service = subset_size.Service(
-        keypoints=args.keypoints, repeated=repeated or [args.repeated], points=args.points, trials=args.trials
+        found = records.read(records.find_file(args.results)).records
+        recalls, repeated = subset_size.collect_recalls(found, args.epsilon, words, args.trials, "day")
+    candidates = {1, 2, 4, 8, 16, most_accurate_size(args.epsilon, words), most_informative_size(args.epsilon, words)}
+    sizes = args.sizes or sorted(size for size in candidates if size < words)
+    service = subset_size.Workload(
+        keypoints=args.keypoints, repeatability=repeated or [args.repeated], points=args.points, trials=args.trials
     )
-    rows = subset_size.choices(args.epsilon, words, sizes, service)
+    rows = subset_size.estimate_sizes(args.epsilon, words, sizes, service)
     print_rich(*subset_size.report(rows, args.epsilon, words, recalls))
     return DONE

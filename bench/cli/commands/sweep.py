@@ -1,15 +1,15 @@
-"""`bench sweep`: a whole suite, on one machine or many."""
+"""`bench sweep`: run a suite, on one machine or many."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 
-from bench.cli.terminal import DONE, FAILED, add_engine, say
+from bench.cli.terminal import DONE, FAILED, add_engine, print_status
 from bench.core.errors import UserError
 
-SUMMARY = "run a suite of experiments, on one machine or many; what was done is not done again"
-EPILOG = """A suite is a name (smoke, paper-table-1, ..., full), or one of your own: module:NAME or path/to/file.py:NAME.
+SUMMARY = "run a suite of experiments, on one machine or many; finished records are not computed again"
+EPILOG = """A suite is a name (smoke, paper-table-1, ..., full), or your own: module:NAME or path/to/file.py:NAME.
 
 examples:
   bench sweep smoke
@@ -20,43 +20,46 @@ examples:
 REQUIRED = ()
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("suite", nargs="?", metavar="SUITE", help="what to run; without it the suites are listed")
-    parser.add_argument("--images", type=Path, metavar="DIR", help="a folder of photographs (default: those of the suite)")
+def add_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("suite", nargs="?", metavar="SUITE", help="the suite; without it, all suites are listed")
+    parser.add_argument("--images", type=Path, metavar="DIR", help="a folder of photographs (default: that of the suite)")
     add_engine(parser)
     parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="folder for the results; resumed if it exists (default: in runs/)"
+        "--out", type=Path, metavar="DIR", help="folder for the results; resumed if it exists (default: a folder in runs/)"
     )
 
 
 def execute(args: argparse.Namespace) -> int:
     from bench.cli import watch
     from bench.runner import engines, suite
-    from bench.runner import plan as runner
+    from bench.runner.plan import build_plan
+    from bench.runner.trial import dry_run
     from leaderboard import run_report
 
     if args.suite is None:
         return _list()
-    chosen = suite.find(args.suite)
+    selected = suite.find(args.suite)
     if args.images is not None:
-        chosen = chosen.on(args.images)
-    if not chosen.parts:
+        selected = selected.with_images(args.images)
+    if not selected.parts:
         raise UserError(f"suite {args.suite!r} has no parts")
     engine = engines.choose_engine(args.workers, args.engine, args.scheduler)
-    plans = [runner.prepared(part, engine.describe) for part in chosen.parts]
-    out = args.out or suite.folder(args.suite)
+    plans = [build_plan(part, engine.describe) for part in selected.parts]
+    for plan in plans:
+        dry_run(plan)
+    out = args.out or suite.choose_folder(args.suite)
     pairs = sum(len(plan.experiments) for plan in plans)
     records = watch.execute_with_progress(plans, out, engine, f"{args.suite}: {pairs} pairs")
-    units = {unit.name: unit for plan in plans for unit in plan.samples}
-    run_report.write(records, list(units.values()), out)
+    samples = {sample.name: sample for plan in plans for sample in plan.samples}
+    run_report.write(records, list(samples.values()), out)
     watch.print_tables(records)
-    say(DONE, f"written to {out}")
+    print_status(DONE, f"written to {out}")
     return FAILED if any(record["status"] == "failed" for record in records) else DONE
 
 
 def _list() -> int:
     from bench.runner import suite
 
-    for name in suite.names():
+    for name in suite.list_suites():
         print(f"{name}: {suite.find(name).summary}")
     return DONE

@@ -1,4 +1,4 @@
-"""`bench train`: the attacker's inversion network for a defense's releases."""
+"""`bench train`: trains an attacker's inversion network for the releases of a defense."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import argparse
 import dataclasses
 from pathlib import Path
 
-from bench.cli.terminal import DONE, add_extractor, add_seed, whole, wholes
+from bench.cli.terminal import DONE, add_extractor, add_seed, parse_whole, parse_wholes
 
-SUMMARY = "train, or resume, the attacker's inversion network for a defense's releases"
+SUMMARY = "train, or resume, an attacker's inversion network for the releases of a defense"
 REQUIRED = ("defense", "images", "out")
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--defense", metavar="SPEC", help="fields given are fixed; of the others the network serves all settings")
+def add_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--defense", metavar="SPEC", help="fixes the given fields; the network learns all others")
     parser.add_argument("--images", type=Path, metavar="DIR", help="a folder of photographs")
     parser.add_argument("--out", type=Path, metavar="FILE", help="the network's weights, a safetensors file")
     parser.add_argument(
@@ -27,59 +27,62 @@ def options(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="FILE",
-        help="a dictionary that quantises photographs which the defense's own was made from; may be repeated",
+        help="a dictionary for photographs that the defense's own was built from; may be repeated",
     )
     parser.add_argument(
         "--encoding",
         choices=("invariant", "released", "positions"),
         default="invariant",
-        help="what the network is told: the release without random order or basis, as it is, or positions alone",
+        help="input of the network: the release without random order or basis, as it is, or positions alone",
     )
-    parser.add_argument("--profile", choices=("cpu", "paper"), default="cpu", help="sizes, where no other option gives them")
-    parser.add_argument("--devices", type=whole, default=1, metavar="N", help="GPUs, or CPU processes, that share each batch")
-    parser.add_argument("--widths", type=wholes, metavar="N,N,...", help="channels of the network's levels")
+    parser.add_argument("--profile", choices=("cpu", "paper"), default="cpu", help="sizes that no other option sets")
+    parser.add_argument("--devices", type=parse_whole, default=1, metavar="N", help="GPUs or CPU processes that share each batch")
+    parser.add_argument("--widths", type=parse_wholes, metavar="N,N,...", help="channels of the network's levels")
     parser.add_argument(
-        "--start", type=Path, metavar="FILE", help="weights to start from, of a network for such releases or for raw descriptors"
+        "--initial-checkpoint",
+        type=Path,
+        metavar="FILE",
+        help="weights of a network for such releases or for raw descriptors, from which the training begins",
     )
-    parser.add_argument("--rate", type=float, metavar="R", help="the learning rate at its peak")
-    parser.add_argument("--steps", type=whole, metavar="N", help="steps of training")
-    parser.add_argument("--batch", type=whole, metavar="N", help="photographs a step")
-    parser.add_argument("--log", type=Path, metavar="DIR", help="writes loss, rate and speed for TensorBoard")
+    parser.add_argument("--rate", type=float, metavar="R", help="peak learning rate")
+    parser.add_argument("--steps", type=parse_whole, metavar="N", help="training steps")
+    parser.add_argument("--batch", type=parse_whole, metavar="N", help="training samples per step")
+    parser.add_argument("--log", type=Path, metavar="DIR", help="write loss, rate and speed for TensorBoard")
     add_seed(parser, "the training")
     add_extractor(parser)
 
 
 def execute(args: argparse.Namespace) -> int:
-    from bench.api import Asset
-    from bench.images.photographs import folder, held_out
+    from bench.images.photographs import list_photographs, split_validation
     from bench.inversion import network_cache
     from bench.inversion.plan import PROFILES, Plan
     from bench.inversion.train import train
     from bench.registry import discovery, spec
+    from bench.settings import Asset
 
     plugin, given = spec.parse(args.defense, discovery.DEFENSE)
     defense = spec.build(plugin, given)
-    served = {name: settings for name, settings in plugin.supported_settings.items() if name not in given}
-    photographs, validation = held_out(folder(args.images), args.validation)
+    supported = {name: settings for name, settings in plugin.supported_settings.items() if name not in given}
+    photographs, validation = split_validation(list_photographs(args.images), args.validation)
     profile = PROFILES[args.profile]
-    chosen = {name: value for name in ("steps", "batch", "rate", "seed") if (value := getattr(args, name)) is not None}
+    overrides = {name: value for name in ("steps", "batch", "rate", "seed") if (value := getattr(args, name)) is not None}
     plan = Plan(
         defense=defense,
-        served=served,
+        supported_settings=supported,
         photographs=photographs,
         validation=validation,
         extractor=spec.read(args.extractor, discovery.EXTRACTOR),
         crossfit=[Asset(file) for file in args.crossfit],
-        start=args.start,
+        initial_checkpoint=args.initial_checkpoint,
         encoding=args.encoding,
         widths=args.widths or profile.widths,
-        training=dataclasses.replace(profile.training, **chosen),
+        training=dataclasses.replace(profile.training, **overrides),
     )
-    key = network_cache.key(plan)
+    key = network_cache.build_key(plan)
     meta = network_cache.fetch(key, args.out)
     if meta is None:
         meta = train(plan, args.out, args.log, args.devices)
-        network_cache.keep(key, args.out)
+        network_cache.save(key, args.out)
     scores = ", ".join(f"{name} {value:.4g}" for name, value in meta["validation"].items())
-    print(f"{args.out}: {meta['crops']} crops of {meta['photographs']} photographs; validation: {scores}")
+    print(f"{args.out}: {meta['crops']} training samples from {meta['photographs']} photographs; validation: {scores}")
     return DONE

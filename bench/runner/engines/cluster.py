@@ -8,20 +8,20 @@ from concurrent.futures import CancelledError
 from typing import TYPE_CHECKING, Any
 
 from bench.core.errors import UserError
-from bench.runner import trial
-from bench.runner.engines import Engine, Job, run_as_completed, worker, write_message
-from bench.runner.trial import Result
+from bench.runner.engines import worker
+from bench.runner.engines.base import Engine, Job, run_as_completed, write_message
+from bench.runner.trial import Result, build_record
 
 if TYPE_CHECKING:
     from distributed import Client
 
-AHEAD = 2  # jobs for each worker: one that it does, and one that lies ready
+AHEAD = 2  # jobs for each worker: one that runs, and one that waits
 THREADS = 1  # of a worker: there is one for each core
 PATIENCE = 60.0  # seconds until the scheduler and a first worker must have answered
 
 
 class Cluster(Engine):
-    """The workers of a scheduler. A job is a task of dask's, known by the job's hash; a lost worker's jobs are done by others."""
+    """The workers of a scheduler. A job is a dask task, keyed by the job's hash; other workers execute the jobs of a lost one."""
 
     name = "dask"
 
@@ -37,20 +37,20 @@ class Cluster(Engine):
             several = [address for address, count in client.nthreads().items() if count != 1]
             if several:
                 raise UserError(f"worker {several[0]} does several jobs at once; start workers with --nthreads 1")
-            found = client.run(worker.described, list(plugins), THREADS)
-        (first, told), *others = found.items()
-        for address, other in others:
-            for name in told:
-                if other.get(name) != told[name]:
-                    raise UserError(f"workers differ in {name}: {first} has {told[name]}, {address} has {other.get(name)}")
-        return told
+            environments = client.run(worker.describe_environment, list(plugins), THREADS)
+        (first, reference), *rest = environments.items()
+        for address, other in rest:
+            for name in reference:
+                if other.get(name) != reference[name]:
+                    raise UserError(f"workers differ in {name}: {first} has {reference[name]}, {address} has {other.get(name)}")
+        return reference
 
     def __call__(self, jobs: Iterator[Job]) -> Iterator[Result]:
         from distributed import KilledWorker
 
         with self._client() as client, client.get_executor() as executor:
             submitted = run_as_completed(
-                lambda job: executor.submit(worker.carry_out, write_message(job, THREADS), key=job.name),
+                lambda job: executor.submit(worker.execute_job, write_message(job, THREADS), key=job.name),
                 lambda: AHEAD * max(1, len(client.nthreads())),  # workers come and go
                 jobs,
             )
@@ -61,14 +61,14 @@ class Cluster(Engine):
                     raise UserError(f"--scheduler {self._scheduler}: the scheduler was lost; run again to go on") from None
                 except KilledWorker:
                     reason = "every worker that began this ended, perhaps for want of memory"
-                    yield Result(record=trial.record(job.experiment, job.sample, status="failed", reason=reason))
+                    yield Result(record=build_record(job.experiment, job.sample, status="failed", reason=reason))
 
     def _client(self) -> Client:
         try:
             from distributed import Client
         except ImportError:
             raise UserError("--engine dask needs distributed: pip install 'feature-privacy-bench[dask]'") from None
-        logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # what matters of it is told by our errors
+        logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # our errors report what matters
         try:
             return Client(self._scheduler, timeout=PATIENCE, set_as_default=False)
         except (OSError, ValueError) as error:

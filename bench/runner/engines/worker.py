@@ -1,4 +1,4 @@
-"""What runs in a process that carries out jobs of another."""
+"""Functions that run in a process that executes jobs of another."""
 
 from __future__ import annotations
 
@@ -9,44 +9,44 @@ from typing import Any
 
 from bench.core import environment, threads
 from bench.core.errors import UserError
-from bench.runner import plan
-from bench.runner.engines import JobMessage
-from bench.runner.trial import Result, Trials
+from bench.runner.engines.base import JobMessage
+from bench.runner.plan import build_plan
+from bench.runner.trial import Result, TrialRunner
 
-_LAST: list[Trials] = []  # whose last unit is kept
-PLANS = 2  # that are kept: jobs come plan by plan, but one that was lost may come late
+_LAST: list[TrialRunner] = []  # the runner whose last sample is in memory
+PLANS = 2  # plans in memory: jobs come plan by plan, but one that was lost may come late
 
 
-def carry_out(letter: JobMessage) -> Result:
-    """Do the job.
+def execute_job(message: JobMessage) -> Result:
+    """Execute the job.
 
     Raises
     ------
     UserError
-        if this process would do another: its source, its libraries or its photographs are not those of the sender.
+        if this process would execute another job: its source, libraries or photographs are not those of the sender.
     """
-    threads.limit(letter.threads)
-    trials = _trials(letter.configuration)
+    threads.limit_threads(message.threads)
+    runner = _build_runner(message.configuration)
     for last in _LAST:
-        if last is not trials:
-            last.forget()
-    _LAST[:] = [trials]
-    run_hash, name = letter.key
-    for cell in trials.plan.experiments:
-        if cell.metadata["run_hash"] == run_hash:
-            return trials.execute(cell, next(unit for unit in trials.plan.samples if unit.name == name))
+        if last is not runner:
+            last.clear()
+    _LAST[:] = [runner]
+    run_hash, name = message.key
+    for experiment in runner.plan.experiments:
+        if experiment.metadata["run_hash"] == run_hash:
+            return runner.execute(experiment, next(sample for sample in runner.plan.samples if sample.name == name))
     raise UserError(
         "a worker has other source, libraries or files than there were when the run began: it would make other records; "
         "start all workers in one environment and folder, and run again"
     )
 
 
-def described(plugins: Iterable[object], count: int) -> dict[str, Any]:
-    """The environment of this process, computing with `count` threads."""
-    threads.limit(count)
+def describe_environment(plugins: Iterable[object], count: int) -> dict[str, Any]:
+    """Return the environment of this process, computing with `count` threads."""
+    threads.limit_threads(count)
     return environment.describe(plugins)
 
 
 @functools.lru_cache(maxsize=PLANS)
-def _trials(asked: bytes) -> Trials:
-    return Trials(plan.planned(pickle.loads(asked)))
+def _build_runner(configuration: bytes) -> TrialRunner:
+    return TrialRunner(build_plan(pickle.loads(configuration)))

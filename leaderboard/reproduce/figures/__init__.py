@@ -8,7 +8,7 @@ import pkgutil
 from leaderboard.reproduce.drawing import Drawing
 
 
-def everything() -> tuple[Drawing, ...]:
-    """All figures."""
-    modules = [importlib.import_module(f"{__name__}.{found.name}") for found in pkgutil.iter_modules(__path__)]
+def load_figures() -> tuple[Drawing, ...]:
+    """Return all figures."""
+    modules = [importlib.import_module(f"{__name__}.{module.name}") for module in pkgutil.iter_modules(__path__)]
     return tuple(module.DRAWING for module in modules)

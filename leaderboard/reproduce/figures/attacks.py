@@ -1,4 +1,4 @@
-"""What each attack paints from subspaces: rows photographs, columns attacks, a figure for each dimension."""
+"""Reconstructions from subspaces: rows are photographs, columns attacks; one figure per dimension."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from leaderboard.figures import Panel, draw
-from leaderboard.reproduce.drawing import Drawing, Scene
+from leaderboard.reproduce.drawing import Drawing, FigureData
 from leaderboard.reproduce.tables import table1
 
 if TYPE_CHECKING:
@@ -15,17 +15,17 @@ if TYPE_CHECKING:
 TITLES = {"database": "database", "clustering": "clustering", "dia": "DIA", "nearest": "nearest"}  # strongest first
 
 
-def drawn(scene: Scene) -> Iterator[tuple[str, Figure]]:
+def draw_figures(data: FigureData) -> Iterator[tuple[str, Figure]]:
     for dim in table1.DIMS:
         panels = []
-        for number, (name, original) in enumerate(scene.originals()):
-            shown = [
+        for number, (name, original) in enumerate(data.load_originals()):
+            row = [
                 Panel(original, "original", ""),
-                scene.panel("raw", name, "raw descriptors"),
-                *(scene.panel(table1.name(attack, dim), name, title) for attack, title in TITLES.items()),
+                data.build_panel("raw", name, "raw descriptors"),
+                *(data.build_panel(table1.format_name(attack, dim), name, title) for attack, title in TITLES.items()),
             ]
-            panels += shown if number == 0 else [Panel(panel.pixels, "", panel.beneath) for panel in shown]
+            panels += row if number == 0 else [Panel(panel.pixels, "", panel.caption) for panel in row]
         yield f"dim{dim}", draw(panels, f"What attacks recover from affine subspaces of dimension {dim}", columns=len(TITLES) + 2)
 
 
-DRAWING = Drawing(name="attacks", draw=drawn, rows=table1.rows)
+DRAWING = Drawing(name="attacks", draw=draw_figures, build_rows=table1.build_rows)

@@ -1,4 +1,4 @@
-"""What DIA paints from LDP-Feat: rows ε, columns m, a figure for each photograph."""
+"""Reconstructions by DIA from LDP-Feat: rows are ε, columns m; one figure per photograph."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from leaderboard.figures import Panel, draw
 from leaderboard.reproduce import scale
-from leaderboard.reproduce.drawing import Drawing, Scene
+from leaderboard.reproduce.drawing import Drawing, FigureData
 from leaderboard.reproduce.tables import table4
 
 if TYPE_CHECKING:
@@ -17,18 +17,18 @@ WORDS = 256_000  # |K| in the paper
 SUBSETS = (1, 2, 4)
 
 
-def drawn(scene: Scene) -> Iterator[tuple[str, Figure]]:
-    factor = scene.setting.profile.scale
+def draw_figures(data: FigureData) -> Iterator[tuple[str, Figure]]:
+    factor = data.setting.profile.scale
     heading = f"DIA on LDP-Feat, |K| = {scale.words(WORDS, factor):,}"
-    for name, original in scene.originals():
+    for name, original in data.load_originals():
         panels = []
         for number, epsilon in enumerate(table4.EPSILONS):
             panels.append(Panel(original, "original", "") if number == 0 else Panel(None, "", ""))
             ours = scale.epsilon(epsilon, factor)
             for subset in SUBSETS:
                 title = f"ε = {ours:.2f}, m = {subset}" + ("" if factor == 1 else f" (paper's ε {epsilon})")
-                panels.append(scene.panel(table4.name(WORDS, epsilon, subset), name, title))
+                panels.append(data.build_panel(table4.format_name(WORDS, epsilon, subset), name, title))
         yield name, draw(panels, f"{heading}; {name}", columns=1 + len(SUBSETS))
 
 
-DRAWING = Drawing(name="epsilon-grid", draw=drawn, rows=table4.rows)
+DRAWING = Drawing(name="epsilon-grid", draw=draw_figures, build_rows=table4.build_rows)

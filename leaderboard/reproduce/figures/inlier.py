@@ -1,4 +1,4 @@
-"""The inlier attack: what the server sees of a query that it localized. The scene appears, and the people before it do not."""
+"""The inlier attack: reconstructions from the inliers of localized queries. They show the scene, not the people before it."""
 
 from __future__ import annotations
 
@@ -8,37 +8,40 @@ from typing import TYPE_CHECKING
 from bench.registry import discovery
 from leaderboard.figures import Panel, draw
 from leaderboard.reproduce import scenes
-from leaderboard.reproduce.drawing import Drawing, Scene
+from leaderboard.reproduce.drawing import Drawing, FigureData
 from leaderboard.reproduce.profiles import Setting
-from leaderboard.reproduce.study import Row, build, reconstruction
+from leaderboard.reproduce.study import Row, build_plugin, build_reconstruction
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PARTS = {"SSIM background": "ssim_background", "foreground": "ssim_foreground"}
-LDP = ("256000", "12", 2)  # |K|, ε, m of the paper that nearly every query is localized with
+LDP = ("256000", "12", 2)  # |K|, ε, m of the paper; nearly every query is localized
 
 
-def rows(setting: Setting) -> tuple[Row, ...]:
-    attack = build(discovery.ATTACK, "inlier", {"trials": round(scenes.TRIALS * setting.profile.trials)})
-    undefended = build(discovery.DEFENSE, "none", {})
-    attacked = {
-        "none, all keypoints (DIA)": (undefended, build(discovery.ATTACK, "dia", {"weights": setting.materials.raw_network})),
+def build_rows(setting: Setting) -> tuple[Row, ...]:
+    attack = build_plugin(discovery.ATTACK, "inlier", {"trials": round(scenes.TRIALS * setting.profile.trials)})
+    undefended = build_plugin(discovery.DEFENSE, "none", {})
+    pairs = {
+        "none, all keypoints (DIA)": (
+            undefended,
+            build_plugin(discovery.ATTACK, "dia", {"weights": setting.materials.raw_network}),
+        ),
         "none, inliers": (undefended, attack),
-        "affine, dim 4, inliers": (build(discovery.DEFENSE, "affine", {"dim": 4}), attack),
-        f"ldp, {scenes.name(*LDP)}, inliers": (scenes.defense(setting, *LDP), attack),
+        "affine, dim 4, inliers": (build_plugin(discovery.DEFENSE, "affine", {"dim": 4}), attack),
+        f"ldp, {scenes.format_name(*LDP)}, inliers": (scenes.build_defense(setting, *LDP), attack),
     }
     return tuple(
-        Row(name=name, labels={}, paper={}, defense=defense, attack=by, task=reconstruction(setting))
-        for name, (defense, by) in attacked.items()
+        Row(name=name, labels={}, paper={}, defense=defense, attack=own_attack, task=build_reconstruction(setting))
+        for name, (defense, own_attack) in pairs.items()
     )
 
 
-def drawn(scene: Scene) -> Iterator[tuple[str, Figure]]:
-    for name, original in scene.originals():
+def draw_figures(data: FigureData) -> Iterator[tuple[str, Figure]]:
+    for name, original in data.load_originals():
         panels = [Panel(original, "original", "")]
-        panels += [scene.panel(row.name, name, row.name, PARTS) for row in rows(scene.setting)]
+        panels += [data.build_panel(row.name, name, row.name, PARTS) for row in build_rows(data.setting)]
         yield name, draw(panels, f"Inlier attack; {name}")
 
 
-DRAWING = Drawing(name="inlier", draw=drawn, rows=rows, place=True)
+DRAWING = Drawing(name="inlier", draw=draw_figures, build_rows=build_rows, uses_queries=True)

@@ -1,8 +1,8 @@
-"""The intersection attack (in no paper) over the number of photographs seen: what it recovers, beside the words truly met.
+"""The intersection attack (in no paper) over the number of observed photographs: its recovery, and the coverage of its words.
 
-It knows no database, and rebuilds one from where subspaces meet. So it can do no better than its releases cover the words that
-the photograph was led through. The share that they do is measured by the owner, who knows these words; the attack has its own
-count of it. The database attack, which knows all words from the start, is what it tends to.
+It knows no database and reconstructs one from intersections of subspaces. Its recovery is limited by the coverage: the fraction
+of the photograph's words that its releases contain. The owner, who knows these words, measures the coverage; the attack has its
+own estimate. The database attack, which knows all words, is the limit.
 """
 
 from __future__ import annotations
@@ -13,86 +13,104 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bench.registry import discovery
-from leaderboard.reproduce.drawing import Drawing, Scene
+from leaderboard.reproduce.drawing import Drawing, FigureData
 from leaderboard.reproduce.profiles import Setting
-from leaderboard.reproduce.run import of
-from leaderboard.reproduce.study import Row, build, reconstruction
+from leaderboard.reproduce.run import select_records
+from leaderboard.reproduce.study import Row, build_plugin, build_reconstruction
 from leaderboard.reproduce.tables import table1
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Of about as many photographs one meets a given word with 95% chance: the fewer words a subspace has, the more it takes.
-MOST = {2: 800, 4: 400, 8: 200, 16: 100}
+# About as many photographs contain a given word with 95% probability. Subspaces with fewer words need more photographs.
+MAX_RELEASES = {2: 800, 4: 400, 8: 200, 16: 100}
 HALVINGS = 5
 
 
-def counts(setting: Setting, dim: int) -> list[int]:
-    """How many releases of other photographs are seen, fewest first."""
-    reduced = setting.profile.reduced.get("others")
-    return [reduced] if reduced else [MOST[dim] >> halvings for halvings in range(HALVINGS, -1, -1)]
+def list_counts(setting: Setting, dim: int) -> list[int]:
+    """Return the numbers of other releases that the attack observes, in ascending order."""
+    override = setting.profile.attack_overrides.get("others")
+    return [override] if override else [MAX_RELEASES[dim] >> halvings for halvings in range(HALVINGS, -1, -1)]
 
 
-def rows(setting: Setting) -> tuple[Row, ...]:
-    found = []
+def build_rows(setting: Setting) -> tuple[Row, ...]:
+    rows = []
     for dim in table1.DIMS:
-        for seen in counts(setting, dim):
-            asked = {"others": seen, "coverage": 1.0}  # so that none is left unseen
-            trials = (
-                (attacked(dim, seen), build(discovery.ATTACK, "intersection", asked), reconstruction(setting)),
-                (covered(dim, seen), None, build(discovery.TASK, "collisions", asked)),
+        for count in list_counts(setting, dim):
+            configuration = {"others": count, "coverage": 1.0}  # 1.0: all of them are used
+            experiments = (
+                (
+                    format_attack_name(dim, count),
+                    build_plugin(discovery.ATTACK, "intersection", configuration),
+                    build_reconstruction(setting),
+                ),
+                (format_coverage_name(dim, count), None, build_plugin(discovery.TASK, "collisions", configuration)),
             )
-            found += [
-                Row(name=name, labels={}, paper={}, defense=table1.lifting(dim, setting), attack=attack, task=task)
-                for name, attack, task in trials
+            rows += [
+                Row(name=name, labels={}, paper={}, defense=table1.build_lifting(dim, setting), attack=attack, task=task)
+                for name, attack, task in experiments
             ]
-    return (*found, *(row for row in table1.rows(setting) if row.labels["attack"] == "database"))
+    return (*rows, *(row for row in table1.build_rows(setting) if row.labels["attack"] == "database"))
 
 
-def attacked(dim: int, seen: int) -> str:
-    return f"intersection, dim {dim}, {seen} seen"
+def format_attack_name(dim: int, count: int) -> str:
+    return f"intersection, dim {dim}, {count} releases"
 
 
-def covered(dim: int, seen: int) -> str:
-    return f"words met, dim {dim}, {seen} seen"
+def format_coverage_name(dim: int, count: int) -> str:
+    return f"coverage, dim {dim}, {count} releases"
 
 
-def drawn(scene: Scene) -> Iterator[tuple[str, Figure]]:
+def draw_figures(data: FigureData) -> Iterator[tuple[str, Figure]]:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9.6, 3.9), layout="constrained", dpi=120)
-    count = len(scene.judged.chosen)
-    over = f"mean over {count} photograph{'s' * (count > 1)}"
-    figure.suptitle(f"The intersection attack, which knows no database; stars: the database attack; {over}", fontsize=9)
-    shares, pictures = figure.subplots(1, 2)
+    photographs = len(data.test_set.photographs)
+    average = f"mean over {photographs} photograph{'s' * (photographs > 1)}"
+    figure.suptitle(f"The intersection attack, which knows no database; stars: the database attack; {average}", fontsize=9)
+    recovery_axes, ssim_axes = figure.subplots(1, 2)
     for number, dim in enumerate(table1.DIMS):
-        seen, color = counts(scene.setting, dim), f"C{number}"
-        recovered = [mean(scene, attacked(dim, count), "recovered") for count in seen]
-        shares.plot(seen, recovered, "o-", color=color, label=f"descriptors, dim {dim}")
-        shares.plot(seen, [mean(scene, covered(dim, count), "coverage") for count in seen], "x--", color=color, label="words met")
-        pictures.plot(seen, [mean(scene, attacked(dim, count), "ssim") for count in seen], "o-", color=color, label=f"dim {dim}")
-        for axes, metric in ((shares, "recovered"), (pictures, "ssim")):
-            known = mean(scene, table1.name("database", dim), metric)
-            axes.plot(seen[-1:], [known], marker="*", markersize=11, linestyle="", color=color, markeredgecolor="black")
-    shares.set_ylabel("share recovered; share of words met (true)")
-    pictures.set_ylabel("SSIM")
-    for axes in (shares, pictures):
+        counts, color = list_counts(data.setting, dim), f"C{number}"
+        recovered = [average_metric(data, format_attack_name(dim, count), "recovered") for count in counts]
+        recovery_axes.plot(counts, recovered, "o-", color=color, label=f"descriptors, dim {dim}")
+        recovery_axes.plot(
+            counts,
+            [average_metric(data, format_coverage_name(dim, count), "coverage") for count in counts],
+            "x--",
+            color=color,
+            label="coverage",
+        )
+        ssim_axes.plot(
+            counts,
+            [average_metric(data, format_attack_name(dim, count), "ssim") for count in counts],
+            "o-",
+            color=color,
+            label=f"dim {dim}",
+        )
+        for axes, metric in ((recovery_axes, "recovered"), (ssim_axes, "ssim")):
+            limit = average_metric(data, table1.format_name("database", dim), metric)
+            axes.plot(counts[-1:], [limit], marker="*", markersize=11, linestyle="", color=color, markeredgecolor="black")
+    recovery_axes.set_ylabel("fraction recovered; coverage of the words (true)")
+    ssim_axes.set_ylabel("SSIM")
+    for axes in (recovery_axes, ssim_axes):
         axes.set_xscale("log", base=2)
-        axes.set_xticks(sorted({count for dim in table1.DIMS for count in counts(scene.setting, dim)}))
-        axes.xaxis.set_major_formatter(lambda count, place: f"{count:g}")
+        axes.set_xticks(sorted({count for dim in table1.DIMS for count in list_counts(data.setting, dim)}))
+        axes.xaxis.set_major_formatter(lambda count, _: f"{count:g}")
         axes.tick_params(axis="x", labelsize=7)
-        axes.set_xlabel("photographs seen (one in 16 shares the words)", fontsize=9)
+        axes.set_xlabel("photographs observed (one in 16 shares the sub-database)", fontsize=9)
         axes.grid(alpha=0.3)
-    shares.set_ylim(0, 1.04)
-    shares.legend(fontsize=7, ncols=2)
-    pictures.legend(fontsize=7)
+    recovery_axes.set_ylim(0, 1.04)
+    recovery_axes.legend(fontsize=7, ncols=2)
+    ssim_axes.legend(fontsize=7)
     yield "", figure
 
 
-def mean(scene: Scene, row: str, metric: str) -> float:
-    """Over the photographs that have it."""
-    values = [record["metrics"][metric] for record in of(scene.ran, row) if record["metrics"].get(metric) is not None]
+def average_metric(data: FigureData, row: str, metric: str) -> float:
+    """Return the mean over the photographs that have the metric."""
+    values = [
+        record["metrics"][metric] for record in select_records(data.result, row) if record["metrics"].get(metric) is not None
+    ]
     return float(np.mean(values)) if values else np.nan
 
 
-DRAWING = Drawing(name="intersection-recovery", draw=drawn, rows=rows)
+DRAWING = Drawing(name="intersection-recovery", draw=draw_figures, build_rows=build_rows)

@@ -1,8 +1,8 @@
-"""Affine and LDP-Feat reconstructions at matched recall: rows photographs, a figure for each dimension of the subspaces.
+"""Affine and LDP-Feat reconstructions at matched recall: rows are photographs; one figure per dimension of the subspaces.
 
-What a defense hides is compared with what another hides only where both serve as well. So the queries of a place are localized
-under each, and each dimension is set beside the ε whose share of localized queries is nearest to its own; both stand above the
-pictures, for no ε need be near. The place's |K| is another than the photographs', at the same chance of the truth (`scale.py`).
+The privacy of two defenses is compared at equal utility. So the queries of a gallery are localized under each defense, and each
+dimension is paired with the ε of nearest recall. Both recalls stand above the pictures, for the nearest may still differ. The
+gallery's |K| differs from the photographs', at the same probability of the true word (`scale.py`).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 
 from leaderboard.figures import Panel, draw
 from leaderboard.reproduce import run, scenes
-from leaderboard.reproduce.drawing import Drawing, Scene
+from leaderboard.reproduce.drawing import Drawing, FigureData
 from leaderboard.reproduce.profiles import Setting
 from leaderboard.reproduce.study import Row
 from leaderboard.reproduce.tables import table1, table4
@@ -27,70 +27,74 @@ MEASURE = "recall_0.25m_2deg"
 ATTACKS = {"database": "database", "dia": "DIA"}
 
 
-def rows(setting: Setting) -> tuple[Row, ...]:
-    """Those of Tables 1 and 4 that are drawn."""
-    lifted = [row for row in table1.rows(setting) if row.labels["attack"] in ATTACKS]
-    drawn_from = {table4.name(WORDS, epsilon, SUBSET) for epsilon in table4.EPSILONS}
-    return (*lifted, *(row for row in table4.rows(setting) if row.name in drawn_from))
+def build_rows(setting: Setting) -> tuple[Row, ...]:
+    """Return the rows of Tables 1 and 4 that are drawn."""
+    affine_rows = [row for row in table1.build_rows(setting) if row.labels["attack"] in ATTACKS]
+    ldp_names = {table4.format_name(WORDS, epsilon, SUBSET) for epsilon in table4.EPSILONS}
+    return (*affine_rows, *(row for row in table4.build_rows(setting) if row.name in ldp_names))
 
 
-def localized(setting: Setting) -> tuple[Row, ...]:
-    """The same defenses on the queries of a place."""
-    task = scenes.task(setting)
-    defenses = {subspaces(dim): table1.lifting(dim, setting) for dim in table1.DIMS}
-    defenses |= {private(epsilon): scenes.defense(setting, str(WORDS), str(epsilon), SUBSET) for epsilon in table4.EPSILONS}
+def build_localization_rows(setting: Setting) -> tuple[Row, ...]:
+    """Return rows of the same defenses on the queries of the gallery."""
+    task = scenes.build_task(setting)
+    defenses = {format_affine_name(dim): table1.build_lifting(dim, setting) for dim in table1.DIMS}
+    defenses |= {
+        format_ldp_name(epsilon): scenes.build_defense(setting, str(WORDS), str(epsilon), SUBSET) for epsilon in table4.EPSILONS
+    }
     return tuple(
         Row(name=name, labels={}, paper={}, defense=defense, attack=None, task=task) for name, defense in defenses.items()
     )
 
 
-def subspaces(dim: int) -> str:
+def format_affine_name(dim: int) -> str:
     return f"affine, dim {dim}"
 
 
-def private(epsilon: int) -> str:
-    return scenes.name(str(WORDS), str(epsilon), SUBSET)
+def format_ldp_name(epsilon: int) -> str:
+    return scenes.format_name(str(WORDS), str(epsilon), SUBSET)
 
 
-def recalls(scene: Scene) -> dict[str, float]:
-    """The share of the place's queries that are localized under each defense."""
-    setting = scene.setting
-    ran = run.execute(localized(setting), setting, run.queries(setting.profile.place), scene.out, DRAWING.name)
-    found = {}
-    for row in ran.rows:
-        values = [record["metrics"][MEASURE] for record in run.of(ran, row.name) if record["status"] == "ok"]
-        found[row.name] = float(np.mean(values)) if values else np.nan
-    return found
+def measure_recalls(data: FigureData) -> dict[str, float]:
+    """Return the fraction of the gallery's queries that are localized under each defense."""
+    setting = data.setting
+    result = run.run_rows(
+        build_localization_rows(setting), setting, run.select_queries(setting.profile.gallery), data.out, DRAWING.name
+    )
+    recalls = {}
+    for row in result.rows:
+        values = [record["metrics"][MEASURE] for record in run.select_records(result, row.name) if record["status"] == "ok"]
+        recalls[row.name] = float(np.mean(values)) if values else np.nan
+    return recalls
 
 
-def nearest(recall: float, known: Mapping[int, float]) -> int:
-    """The ε whose recall is nearest; the smallest of several."""
-    return min(sorted(known), key=lambda epsilon: abs(known[epsilon] - recall))
+def find_nearest_epsilon(recall: float, recalls: Mapping[int, float]) -> int:
+    """Return the ε whose recall is nearest; the smallest if several are."""
+    return min(sorted(recalls), key=lambda epsilon: abs(recalls[epsilon] - recall))
 
 
-def drawn(scene: Scene) -> Iterator[tuple[str, Figure]]:
-    known = recalls(scene)
-    of_epsilon = {epsilon: known[private(epsilon)] for epsilon in table4.EPSILONS}
+def draw_figures(data: FigureData) -> Iterator[tuple[str, Figure]]:
+    recalls = measure_recalls(data)
+    ldp_recalls = {epsilon: recalls[format_ldp_name(epsilon)] for epsilon in table4.EPSILONS}
     for dim in table1.DIMS:
-        recall = known[subspaces(dim)]
-        epsilon = nearest(recall, of_epsilon)
+        recall = recalls[format_affine_name(dim)]
+        epsilon = find_nearest_epsilon(recall, ldp_recalls)
         panels = []
-        for number, (name, original) in enumerate(scene.originals()):
-            shown = [
+        for number, (name, original) in enumerate(data.load_originals()):
+            row = [
                 Panel(original, "original", ""),
                 *(
-                    scene.panel(table1.name(attack, dim), name, f"{title}, dim {dim}: recall {recall:.0%}")
+                    data.build_panel(table1.format_name(attack, dim), name, f"{title}, dim {dim}: recall {recall:.0%}")
                     for attack, title in ATTACKS.items()
                 ),
-                scene.panel(
-                    table4.name(WORDS, epsilon, SUBSET),
+                data.build_panel(
+                    table4.format_name(WORDS, epsilon, SUBSET),
                     name,
-                    f"DIA, paper's ε {epsilon}, m = {SUBSET}: recall {of_epsilon[epsilon]:.0%}",
+                    f"DIA, paper's ε {epsilon}, m = {SUBSET}: recall {ldp_recalls[epsilon]:.0%}",
                 ),
             ]
-            panels += shown if number == 0 else [Panel(panel.pixels, "", panel.beneath) for panel in shown]
+            panels += row if number == 0 else [Panel(panel.pixels, "", panel.caption) for panel in row]
         heading = f"Affine subspaces and LDP-Feat at the recall that is nearest (of queries within 0.25 m and 2°), dim {dim}"
         yield f"dim{dim}", draw(panels, heading, columns=len(ATTACKS) + 2)
 
 
-DRAWING = Drawing(name="matched-recall", draw=drawn, rows=rows)
+DRAWING = Drawing(name="matched-recall", draw=draw_figures, build_rows=build_rows)

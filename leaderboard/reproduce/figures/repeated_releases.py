@@ -1,4 +1,4 @@
-"""Repeated releases of the same features (in no paper): the chance that the true word is told, beside the bound that T ε sets."""
+"""Repeated releases of the same features (in no paper): the probability of finding the true word, beside the bound of T ε."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from leaderboard import multi_release
 from leaderboard.reproduce import scale
-from leaderboard.reproduce.drawing import Drawing, Scene
+from leaderboard.reproduce.drawing import Drawing, FigureData
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -16,11 +16,11 @@ WORDS, SUBSET, EPSILONS = 256_000, 2, (10, 12)  # the paper's operating point fo
 RELEASES = 8
 
 
-def drawn(scene: Scene) -> Iterator[tuple[str, Figure]]:
-    factor = scene.setting.profile.scale
+def draw_figures(data: FigureData) -> Iterator[tuple[str, Figure]]:
+    factor = data.setting.profile.scale
     for epsilon in EPSILONS:
-        curve = multi_release.rows(scale.epsilon(epsilon, factor), scale.words(WORDS, factor), SUBSET, RELEASES)
+        curve = multi_release.build_rows(scale.epsilon(epsilon, factor), scale.words(WORDS, factor), SUBSET, RELEASES)
         yield f"epsilon{epsilon}", multi_release.draw(curve)
 
 
-DRAWING = Drawing(name="repeated-releases", draw=drawn)
+DRAWING = Drawing(name="repeated-releases", draw=draw_figures)

@@ -8,8 +8,8 @@ import pkgutil
 from leaderboard.reproduce.study import Table
 
 
-def everything() -> dict[str, Table]:
-    """All tables by the name that the command calls them."""
-    modules = [importlib.import_module(f"{__name__}.{found.name}") for found in pkgutil.iter_modules(__path__)]
+def load_tables() -> dict[str, Table]:
+    """Return all tables by name."""
+    modules = [importlib.import_module(f"{__name__}.{module.name}") for module in pkgutil.iter_modules(__path__)]
     tables: list[Table] = [module.TABLE for module in modules]
     return {table.name: table for table in tables}

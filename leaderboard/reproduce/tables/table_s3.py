@@ -1,4 +1,7 @@
-"""Table S3: what a subspace meets of the manifold of descriptors. `bench/tasks/intersections.py` says how the paper is read."""
+"""Table S3: intersections of a subspace with the manifold of descriptors.
+
+`bench/tasks/intersections.py` explains the interpretation of the paper.
+"""
 
 from __future__ import annotations
 
@@ -7,32 +10,32 @@ from collections.abc import Mapping
 
 from bench.registry import discovery
 from leaderboard.reproduce import published
-from leaderboard.reproduce.claims import Cell, Claim, falling, greater
+from leaderboard.reproduce.claims import Claim, TableEntry, falling, greater
 from leaderboard.reproduce.profiles import Setting
-from leaderboard.reproduce.study import Measure, Row, Table, build
-from leaderboard.reproduce.tables.table1 import lifting
+from leaderboard.reproduce.study import Measure, Row, Table, build_plugin
+from leaderboard.reproduce.tables.table1 import build_lifting
 
 COUNTS = (5, 10, 20, 50)
 PRINTED = tuple(f"success_top{count}" for count in COUNTS)
 
 
-def rows(setting: Setting) -> tuple[Row, ...]:
-    each = math.ceil(setting.profile.subspaces / setting.photographs)
-    task = build(discovery.TASK, "intersections", {"subspaces": each})
+def build_rows(setting: Setting) -> tuple[Row, ...]:
+    per_photograph = math.ceil(setting.profile.subspaces / setting.photographs)
+    task = build_plugin(discovery.TASK, "intersections", {"subspaces": per_photograph})
     return tuple(
         Row(
             name=f"dim {line['dim']}",
             labels={"dim": line["dim"]},
-            paper=published.numbers(line, PRINTED),
-            defense=lifting(int(line["dim"]), setting),
+            paper=published.parse_numbers(line, PRINTED),
+            defense=build_lifting(int(line["dim"]), setting),
             attack=None,
             task=task,
         )
-        for line in published.lines("tableS3_intersecting_subspaces")
+        for line in published.read_rows("tableS3_intersecting_subspaces")
     )
 
 
-def claims(paper: Mapping[Cell, float]) -> tuple[Claim, ...]:
+def build_claims(paper: Mapping[TableEntry, float]) -> tuple[Claim, ...]:
     return (
         Claim(
             text="Success falls as N grows.",
@@ -51,14 +54,14 @@ TABLE = Table(
     name="tableS3",
     title="Table S3: intersecting adversarial subspaces (success, %)",
     measures={
-        **{measure: Measure(metric=measure, times=100, digits=2) for measure in PRINTED},
-        **{f"with a_i, top{count}": Measure(metric=f"with_adversarial_top{count}", times=100, digits=2) for count in COUNTS},
+        **{measure: Measure(metric=measure, factor=100, digits=2) for measure in PRINTED},
+        **{f"with a_i, top{count}": Measure(metric=f"with_adversarial_top{count}", factor=100, digits=2) for count in COUNTS},
         "subspaces": Measure(metric="subspaces", digits=0),
     },
-    rows=rows,
-    claims=claims,
+    build_rows=build_rows,
+    build_claims=build_claims,
     notes=(
-        "A word near a subspace succeeds if it matches one of the m/2 + 1 points that the subspace was made of, by the ratio "
+        "A word near a subspace succeeds if it matches one of the m/2 + 1 points that the subspace was built from, by the ratio "
         "test at 0.8. The adversarial words themselves are left out of the N; with them, success at m = 16 and N = 5 is 100% "
         "whatever the data, which is not what the paper prints.",
         "Subspaces: of each photograph; its descriptors are lifted again until there are as many.",

@@ -1,25 +1,25 @@
 "use strict";
 
-// ---- which results
+// ---- selection of a group
 
-const choice = document.getElementById("board");
-function chooseBoard() {
-  for (const board of document.querySelectorAll(".board")) board.hidden = board.id !== choice.value;
+const choice = document.getElementById("group");
+function chooseGroup() {
+  for (const group of document.querySelectorAll(".group")) group.hidden = group.id !== choice.value;
 }
 if (choice) {
-  choice.addEventListener("change", chooseBoard);
-  chooseBoard();
+  choice.addEventListener("change", chooseGroup);
+  chooseGroup();
 }
 
 // ---- sorting and filtering
 
-for (const board of document.querySelectorAll(".board")) {
-  const body = board.querySelector("tbody");
-  const rows = [...body.rows]; // as listed: by rank
-  const filter = board.querySelector(".filter");
-  const only = board.querySelector(".only"); // the strongest attack on each
-  const sorting = board.querySelector(".sorting");
-  const headers = [...board.querySelectorAll("thead th")];
+for (const group of document.querySelectorAll(".group")) {
+  const body = group.querySelector("tbody");
+  const rows = [...body.rows]; // in the listed order: by rank
+  const filter = group.querySelector(".filter");
+  const only = group.querySelector(".only"); // the strongest attack on each defense
+  const sorting = group.querySelector(".sorting");
+  const headers = [...group.querySelectorAll("thead th")];
   const texts = new Map(rows.map((row) => [row, row.textContent.toLowerCase()]));
   let column = "";
   let direction = 1;
@@ -28,7 +28,7 @@ for (const board of document.querySelectorAll(".board")) {
 
   function compare(one, other) {
     const [a, b] = [value(one), value(other)];
-    if (a === "" || b === "") return (a === "") - (b === ""); // what is missing stands at the end, either way
+    if (a === "" || b === "") return (a === "") - (b === ""); // missing values come last in both directions
     const difference = Number(a) - Number(b);
     return direction * (Number.isNaN(difference) ? a.localeCompare(b, "en", { numeric: true }) : difference);
   }
@@ -49,7 +49,7 @@ for (const board of document.querySelectorAll(".board")) {
       else header.removeAttribute("aria-sort");
     }
     sorting.value = column;
-    board.querySelector(".count").textContent = `${count} of ${rows.length} rows`;
+    group.querySelector(".count").textContent = `${count} of ${rows.length} rows`;
   }
 
   for (const header of headers) {
@@ -70,29 +70,29 @@ for (const board of document.querySelectorAll(".board")) {
   show();
 }
 
-// ---- cells: links open them, so that each has an address, and the keyboard and the way back work as everywhere
+// ---- experiments: links open them, so that each has an address, and the keyboard and the browser's history work
 
-let opener = null; // where the reader comes from: following a link takes the focus from it
+let opener = null; // the link that the reader followed, which gets the focus back
 
 document.addEventListener("click", (event) => {
-  const link = event.target.closest('a[href^="#cell-"]');
+  const link = event.target.closest('a[href^="#experiment-"]');
   if (link && !link.closest("dialog")) opener = link;
 });
 
-function openCell() {
-  const wanted = location.hash.startsWith("#cell-") ? document.getElementById(location.hash.slice(1)) : null;
+function openExperiment() {
+  const wanted = location.hash.startsWith("#experiment-") ? document.getElementById(location.hash.slice(1)) : null;
   for (const dialog of document.querySelectorAll("dialog[open]")) if (dialog !== wanted) dialog.close();
   if (wanted && !wanted.open) {
     wanted.showModal();
     wanted.scrollTop = 0;
   }
 }
-window.addEventListener("hashchange", openCell);
+window.addEventListener("hashchange", openExperiment);
 
 for (const dialog of document.querySelectorAll("dialog")) {
   dialog.querySelector(".close").addEventListener("click", () => dialog.close());
   dialog.addEventListener("click", (event) => {
-    if (event.target === dialog) dialog.close(); // beside it
+    if (event.target === dialog) dialog.close(); // outside the content
   });
   dialog.addEventListener("close", () => {
     if (location.hash === `#${dialog.id}`) history.replaceState(null, "", "#");
@@ -106,7 +106,7 @@ function comparison(dialog) {
   const stage = dialog.querySelector(".stage");
   if (!stage) return;
   const slider = stage.querySelector("input");
-  const [original, made] = [stage.querySelector(".original"), stage.querySelector(".made")];
+  const [original, reconstruction] = [stage.querySelector(".original"), stage.querySelector(".reconstruction")];
   const buttons = [...dialog.querySelectorAll(".strip button")];
 
   function slide() {
@@ -115,17 +115,17 @@ function comparison(dialog) {
   }
 
   function choose(button) {
-    const { unit, score, made: made_, original: original_ } = button.dataset;
-    made.src = made_;
-    made.alt = `What the attack makes of ${unit}`;
-    original.hidden = !original_;
-    slider.disabled = !original_;
-    if (original_) {
-      original.src = original_;
-      original.alt = `The photograph ${unit}`;
+    const { sample, score, reconstruction: reconstructionPath, original: originalPath } = button.dataset;
+    reconstruction.src = reconstructionPath;
+    reconstruction.alt = `The reconstruction of ${sample}`;
+    original.hidden = !originalPath;
+    slider.disabled = !originalPath;
+    if (originalPath) {
+      original.src = originalPath;
+      original.alt = `The photograph ${sample}`;
     }
-    stage.classList.toggle("alone", !original_);
-    dialog.querySelector("output").textContent = [unit, score, original_ ? "" : "the photograph is not beside these records"]
+    stage.classList.toggle("alone", !originalPath);
+    dialog.querySelector("output").textContent = [sample, score, originalPath ? "" : "the photograph is not beside these records"]
       .filter(Boolean)
       .join(" · ");
     for (const other of buttons) other.setAttribute("aria-pressed", String(other === button));
@@ -134,9 +134,9 @@ function comparison(dialog) {
   slider.addEventListener("input", slide);
   for (const button of buttons) button.addEventListener("click", () => choose(button));
   slide();
-  // Pictures are fetched when they are first looked at.
+  // Images are fetched when the dialog first opens.
   new MutationObserver(() => {
-    if (dialog.open && !made.src) choose(buttons[0]);
+    if (dialog.open && !reconstruction.src) choose(buttons[0]);
   }).observe(dialog, { attributeFilter: ["open"] });
 }
 
@@ -148,11 +148,11 @@ function copying(dialog) {
       await navigator.clipboard.writeText(code.textContent);
       button.textContent = "Copied";
     } catch {
-      getSelection().selectAllChildren(code); // without leave to write, it is at least selected
+      getSelection().selectAllChildren(code); // without permission to write, the text is at least selected
       button.textContent = "Selected";
     }
     setTimeout(() => (button.textContent = "Copy"), 1500);
   });
 }
 
-openCell();
+openExperiment();

@@ -1,0 +1,53 @@
+"""Reads and writes hloc's lists of image pairs: one line `query reference` for each pair, the best reference first."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from bench.core.errors import UserError
+from bench.formats import lists
+
+
+def read(path: Path) -> dict[str, list[str]]:
+    """Return query -> references, in the order of the file.
+
+    Raises
+    ------
+    UserError
+        naming file and line, if a line is not a pair or occurs twice, or there is no pair.
+    """
+    pairs: dict[str, list[str]] = {}
+    for number, fields in lists.read_fields(path):
+        if len(fields) != 2:
+            raise UserError(f"{path}:{number}: a pair is two names, 'query reference', but there are {len(fields)} fields")
+        query, reference = fields
+        references = pairs.setdefault(query, [])
+        if reference in references:
+            raise UserError(f"{path}:{number}: {query} {reference} occurs a second time")
+        references.append(reference)
+    if not pairs:
+        raise UserError(f"{path}: the file is empty; expected lines of 'query reference'")
+    return pairs
+
+
+def write(path: Path, pairs: Mapping[str, Sequence[str]]) -> int:
+    """Write query -> references and return the number of pairs.
+
+    Raises
+    ------
+    UserError
+        if a name contains a space: the file could not be read.
+    """
+    rows = [(query, reference) for query, references in pairs.items() for reference in references]
+    for name in {*pairs, *(reference for _, reference in rows)}:
+        if len(name.split()) != 1:
+            raise UserError(f"{name!r}: a list of pairs cannot hold a name with a space in it")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("".join(f"{query} {reference}\n" for query, reference in rows), encoding="utf-8")
+    return len(rows)
+
+
+def pair_all(names: Sequence[str]) -> dict[str, Sequence[str]]:
+    """Return every pair of names once, as `write` takes them."""
+    return {name: names[index + 1 :] for index, name in enumerate(names)}

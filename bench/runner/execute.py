@@ -1,0 +1,130 @@
+"""Executes plans: resumes, survives failures, and yields records.
+
+Every attack sees the same release. A resumed run gives the records of an uninterrupted one, whatever the engine.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+
+from bench.api import Attack, Dataset, Defense, Extractor, Metric
+from bench.images.samples import Images
+from bench.registry import discovery, spec
+from bench.runner import directory, records, trial
+from bench.runner.engines.base import IN_PROCESS, Engine, Job
+from bench.runner.plan import Plan, RunConfiguration, build_plan, cross
+from bench.runner.records import EVERY_SAMPLE, Record
+from bench.runner.trial import Result, dry_run
+from bench.task_api import Task
+
+
+def run(
+    defenses: Sequence[Defense],
+    attacks: Sequence[Attack] = (),
+    images: Images = None,
+    *,
+    extractor: Extractor | None = None,
+    task: Task | None = None,
+    dataset: Dataset | None = None,
+    seed: int = 0,
+    metrics: Sequence[Metric] = (),
+    out: Path | str | None = None,
+) -> list[Record]:
+    """Run every defense against every attack, and return one record for each sample of each pair.
+
+    Parameters
+    ----------
+    defenses, attacks : plugins, such as `[LDP(epsilon=10)]` and `[DIA()]`
+    images : a folder, files or sources, or None for the built-in photographs
+    extractor : `Sift()` if None
+    task : `Reconstruction()` if None
+    dataset : the scene, for a task that needs one
+    seed : of everything random. A release whose seed is known is for measuring and protects nobody.
+    metrics : metrics that need a setting, such as a file, beside all that need none
+    out : a folder for records and reconstructions; its finished records are not computed again
+
+    Raises
+    ------
+    UserError
+        if something is wrong with the arguments; nothing has been written then.
+    """
+    task = task or spec.read("reconstruction", discovery.TASK)
+    configuration = RunConfiguration(
+        pairs=cross(task, defenses, attacks),
+        images=images,
+        task=task,
+        extractor=extractor or spec.read("sift", discovery.EXTRACTOR),
+        dataset=dataset,
+        seed=seed,
+        metrics=tuple(metrics),
+    )
+    plan = build_plan(configuration)
+    dry_run(plan)
+    return sort_records([plan], execute([plan], None if out is None else Path(out)))
+
+
+def execute(plans: Sequence[Plan], out: Path | None = None, engine: Engine = IN_PROCESS) -> Iterator[Record]:
+    """Execute plans and yield their records: first those that `out` already holds, then new ones as they are computed.
+
+    An experiment that several plans share is executed once. Only one process at a time writes a folder, and only this process
+    does, whatever the engine. `sort_records` puts the records into the order of the plans.
+
+    Parameters
+    ----------
+    out : the folder to write or resume; None stores nothing
+    engine : executes the jobs; by default this process, in the order of the plans
+
+    Raises
+    ------
+    UserError
+        before anything is written, if `out` cannot be written, holds a damaged record, or another process writes to it.
+    OSError
+        if the disk is full; every record yielded so far is stored.
+    """
+    if out is None:
+        yield from (result.record for result in _run_missing(plans, set(), engine))
+        return
+    with records.Log(out / records.FILE) as log:
+        if log.before.notice:
+            logging.getLogger(__name__).warning(log.before.notice)
+        directory.write_plan(out, plans)
+        finished = {records.key(record): record for record in log.before.records if record["status"] != "failed"}
+        planned = dict.fromkeys(key for plan in plans for key in plan.list_record_keys())
+        resumed = [finished[key] for key in planned if key in finished]
+        yield from resumed
+        with directory.RunningJobs(out, engine.name) as running:
+            for result in _run_missing(plans, set(map(records.key, resumed)), engine, running.track):
+                directory.write_result(result, out)
+                log.append(result.record)
+                running.remove(result.record)
+                yield result.record
+
+
+def sort_records(plans: Sequence[Plan], unsorted: Iterable[Record]) -> list[Record]:
+    """Return records in the order of the plans, which does not depend on the engine."""
+    keys = dict.fromkeys(key for plan in plans for key in plan.list_record_keys())
+    order = {key: number for number, key in enumerate(keys)}
+    return sorted(unsorted, key=lambda record: order[records.key(record)])
+
+
+def _run_missing(
+    plans: Sequence[Plan],
+    finished: set[tuple[str, str]],
+    engine: Engine,
+    track: Callable[[Iterator[Job]], Iterator[Job]] = lambda jobs: jobs,
+) -> Iterator[Result]:
+    """Yield the results that are not finished. First come those that do not apply and need no engine."""
+    begun = set(finished)
+    for experiment in (experiment for plan in plans for experiment in plan.experiments if experiment.reason is not None):
+        if (key := (experiment.metadata["run_hash"], EVERY_SAMPLE)) not in begun:
+            begun.add(key)
+            yield Result(record=trial.build_record(experiment, None, status="n/a", reason=experiment.reason))
+    jobs: dict[tuple[str, str], Job] = {}
+    for plan in plans:
+        applicable = [experiment for experiment in plan.experiments if experiment.reason is None]
+        for job in (Job(plan, experiment, sample) for sample in plan.samples for experiment in applicable):
+            if job.key not in finished:
+                jobs.setdefault(job.key, job)
+    yield from engine(track(iter(jobs.values())))

@@ -1,0 +1,76 @@
+"""What an attacker may know beside the release, one class each.
+
+An attack lists classes in its `needs`, and `View.know(Class)` returns an object of that class. `bench run` fills them in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+from bench.types import Bytes, Release
+
+if TYPE_CHECKING:
+    from bench.codebook.public import Public
+    from bench.localization.server import Server
+
+
+class Knowledge:
+    """Base class of everything that an attack may ask for."""
+
+    description: ClassVar[str]  # for messages
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class DefenseDatabase(Knowledge):
+    """The database W of a lifting."""
+
+    description = "the database W that lifting drew its adversarial descriptors from"
+
+    words: Bytes  # (W, D)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PublicDatabase(Knowledge):
+    """A database Z of the attacker's own."""
+
+    description = "a database Z of the attacker's own, from other photographs"
+
+    words: Bytes  # (Z, D)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class OtherReleases(Knowledge):
+    """Releases of other photographs, made by the same defense with the same database."""
+
+    description = "other releases made with the same database"
+
+    draw: Callable[[int], Iterator[Release]]  # from a number to the first so many releases
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RepeatedReleases(Knowledge):
+    """Further releases of the same photograph: as many as `Attack.repeats` says."""
+
+    description = "further releases of the same photograph"
+
+    releases: tuple[Release, ...]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PublicAssets(Knowledge):
+    """Dictionaries that everyone can read. An attack with a network trained on public photographs asks for this."""
+
+    description = "networks trained on public photographs, and public dictionaries"
+
+    assets: Public
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ServerMap(Knowledge):
+    """The server of a localization service, with its map."""
+
+    description = "the server's map"
+
+    server: Server
