@@ -14,19 +14,14 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import torch
 
 from bench.api import Defense, DescriptorAttack, Extractor, View
 from bench.codebook.public import ASSETS, Public
-from bench.context.encoding import build_graph, prior_odds
-from bench.context.network import Belief
 from bench.context.weights import Network, load
 from bench.inversion.weights import explain_incompatible
 from bench.settings import Asset
 from bench.threat_model import PublicAssets
 from bench.types import Floats, WordSets
-
-ESTIMATES = {"word": Belief.word, "mean": Belief.mean}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,6 +44,11 @@ class Context(DescriptorAttack):
         return {"weights": self._network().digest}
 
     def recover(self, view: View, rng: np.random.Generator) -> Floats:
+        import torch
+
+        from bench.context.encoding import build_graph, prior_odds
+        from bench.context.network import Belief
+
         release = view.release
         if not isinstance(release, WordSets):
             raise TypeError(f"context attacks WordSets, got {type(release).__name__}")
@@ -57,7 +57,7 @@ class Context(DescriptorAttack):
         graph = build_graph([release], [odds], module.shape.neighbours)
         with torch.inference_mode():
             graph = graph.to(next(module.parameters()).device)
-            estimates = ESTIMATES[self.estimate](module(graph), graph.candidates)
+            estimates = getattr(Belief, self.estimate)(module(graph), graph.candidates)
         return estimates.cpu().numpy()
 
     def _path(self) -> Path:

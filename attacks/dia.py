@@ -18,8 +18,6 @@ import numpy as np
 from bench.api import Defense, Extractor, ImageAttack, View
 from bench.codebook.public import ASSETS, Public
 from bench.core.errors import UserError
-from bench.inversion.encoding import encode_settings
-from bench.inversion.reconstruct import reconstruct_image
 from bench.inversion.symmetry import find_symmetries
 from bench.inversion.weights import Network, explain_incompatible, load
 from bench.settings import Asset
@@ -43,6 +41,9 @@ class DIA(ImageAttack):
         return {"weights": self._network(defense, extractor, public).digest}
 
     def reconstruct(self, view: View, rng: np.random.Generator) -> Floats:
+        from bench.inversion.encoding import encode_settings
+        from bench.inversion.reconstruct import reconstruct_image
+
         network = self._network(view.defense, view.extractor, view.know(PublicAssets).assets)
         settings = encode_settings(view.defense, network.supported_settings)
         symmetries = find_symmetries(view.extractor)

@@ -14,7 +14,6 @@ import numpy as np
 from bench.api import Defense, Extractor, ImageAttack, View
 from bench.codebook.public import ASSETS, Public
 from bench.core.errors import UserError
-from bench.inversion.reconstruct import reconstruct_image
 from bench.inversion.symmetry import POSITION_SYMMETRIES
 from bench.inversion.weights import Network, explain_other_features, load
 from bench.settings import Asset
@@ -41,6 +40,8 @@ class Keypoints(ImageAttack):
         return {"weights": self._network().digest}
 
     def reconstruct(self, view: View, rng: np.random.Generator) -> Floats:
+        from bench.inversion.reconstruct import reconstruct_image
+
         return reconstruct_image(
             self._network().module, view.release, POSITION_SYMMETRIES, np.empty(0, np.float32), 0, "positions"
         )

@@ -15,9 +15,9 @@ these limits.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-from torch import Tensor
 
 from bench.api import Defense, DescriptorAttack, Extractor, View
 from bench.codebook.public import Public
@@ -27,6 +27,9 @@ from bench.geometry.nearest_words import unit_rows
 from bench.geometry.subspaces import guess_descriptors
 from bench.geometry.vertices import find_unit_vertices
 from bench.types import Floats, Indices, Subspaces
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.api import Attack, Dataset, Defense, DescriptorAttack, Extractor, ImageAttack, Metric
+from bench.api import Attack, Dataset, Defense, DescriptorAttack, Extractor, ImageAttack, Metric, SelectiveAttack
 from bench.cache import feature_cache, store
 from bench.codebook import dictionary
 from bench.codebook.examples import draw_features
@@ -27,6 +27,8 @@ from bench.formats import tensor_file
 from bench.geometry.nearest_words import unit_rows
 from bench.images import photographs
 from bench.images.samples import Sample
+from bench.localization import maps
+from bench.localization.scene_index import SceneIndex
 from bench.task_api import Outcome, ProtectedImage, Task, Trial
 from bench.tasks.reconstruction import Reconstruction, build_view
 from bench.types import Descriptors, Features, Floats, Indices, Release, Subspaces, WordSets
@@ -34,11 +36,11 @@ from bench.types import Descriptors, Features, Floats, Indices, Release, Subspac
 TOLERANCE = 1e-5  # of norms and angles in float32
 
 
-NO_SAMPLE = Sample(name="made up", images=())
+EMPTY_SAMPLE = Sample(name="made up", images=())
 
 
-def shot(secret: Features, release: Release) -> ProtectedImage:
-    """Features and their release, of a black photograph."""
+def build_image(secret: Features, release: Release) -> ProtectedImage:
+    """Return features with their release, as those of a black photograph."""
     return ProtectedImage(pixels=lambda: np.zeros((*secret.size[::-1], 3), np.uint8), secret=secret, release=release)
 
 
@@ -47,14 +49,14 @@ def check_defense(defense: Defense, public: Public, secret: Features) -> None:
     before = copy.deepcopy(secret)
     release = defense.protect(secret, public, np.random.default_rng(1))
     assert type(release) is defense.releases, f"released {type(release).__name__}, declares {defense.releases.__name__}"
-    assert same(secret, before), "changed the secret"
+    assert are_equal(secret, before), "changed the secret"
     assert not _shared(release, secret), "the release shares memory with the secret"
     assert np.array_equal(release.keypoints, secret.keypoints), "keypoints are released as they are"
     assert release.size == secret.size
     _check_release(release, len(secret))
-    assert same(release, defense.protect(secret, public, np.random.default_rng(1))), "the same rng gave another release"
+    assert are_equal(release, defense.protect(secret, public, np.random.default_rng(1))), "the same rng gave another release"
     if not isinstance(release, Descriptors):
-        assert not same(release, defense.protect(secret, public, np.random.default_rng(2))), "another rng gave the same release"
+        assert not are_equal(release, defense.protect(secret, public, np.random.default_rng(2))), "another rng gave the same release"
     privacy = defense.privacy(public)
     assert privacy.guarantee
     assert privacy.epsilon is None or privacy.epsilon >= 0
@@ -70,57 +72,70 @@ def check_applicability(attack: Attack, defense: Defense, extractor: Extractor, 
     return reason is None
 
 
-def check_attack(attack: Attack, defense: Defense, extractor: Extractor, secret: Features) -> None:
-    """An attack that applies returns what it should, and knows the release and public knowledge alone.
+def check_attack(
+    attack: Attack,
+    defense: Defense,
+    extractor: Extractor,
+    secret: Features,
+    *,
+    sample: Sample = EMPTY_SAMPLE,
+    scene_index: SceneIndex | None = None,
+) -> None:
+    """Check that an attack returns what its class declares, and reads the release and its declared knowledge alone.
 
-    What it returns must be bit-identical when the secret and the caches are overwritten after the release, those on disk too.
+    Its result must be bit-identical when the secret and the caches are overwritten after the release, those on disk too. An attack
+    that needs the server's map is checked with a `sample` of the scene of `scene_index`.
     """
     with tempfile.TemporaryDirectory() as folder, store.use_folder(Path(folder)):
-        _check_attack(attack, defense, extractor, secret)
+        _check_attack(attack, defense, extractor, secret, sample, scene_index)
 
 
-def _check_attack(attack: Attack, defense: Defense, extractor: Extractor, secret: Features) -> None:
-    cached: list[Indices] = []
+def _check_attack(
+    attack: Attack, defense: Defense, extractor: Extractor, secret: Features, sample: Sample, scene_index: SceneIndex | None
+) -> None:
+    quantised: list[Indices] = []
 
-    def quantise(known: dictionary.Dictionary, rows: Any) -> Indices:
-        cached.append(feature_cache.find_nearest_words(known, rows))
-        return cached[-1]
+    def quantise(words: dictionary.Dictionary, rows: Any) -> Indices:
+        quantised.append(feature_cache.find_nearest_words(words, rows))
+        return quantised[-1]
 
-    public = Public(quantise)
+    public = Public(quantise, scene_index=scene_index)
     store.fetch(feature_cache.KIND, "the secret", lambda: (feature_cache.to_arrays(secret), {"size": list(secret.size)}))
     mine = copy.deepcopy(secret)
-    strangers = [draw_features(len(secret), seed) for seed in range(5, 8)]
+    other_secrets = [draw_features(len(secret), seed, secret.descriptors.shape[1]) for seed in range(5, 8)]
 
-    def others(count: int) -> Iterator[Release]:
-        return (defense.protect(features, Public(), np.random.default_rng(4)) for features in strangers[:count])
+    def draw_others(count: int) -> Iterator[Release]:
+        return (defense.protect(features, Public(), np.random.default_rng(4)) for features in other_secrets[:count])
 
     trial = Trial(
-        sample=NO_SAMPLE,
-        images=(shot(mine, defense.protect(mine, public, np.random.default_rng(1))),),
+        sample=sample,
+        images=(build_image(mine, defense.protect(mine, public, np.random.default_rng(1))),),
         defense=defense,
         attack=attack,
         extractor=extractor,
         public=public,
         metrics=(),
         rng=np.random.default_rng(3),
-        others=others,
+        others=draw_others,
         repeats=tuple(defense.protect(mine, public, np.random.default_rng([2, number])) for number in range(attack.repeats())),
     )
-    first = _estimate(trial)
+    estimate = _estimate(trial)
     if isinstance(attack, DescriptorAttack):
-        assert first.shape == secret.descriptors.shape
-        np.testing.assert_allclose(np.linalg.norm(first, axis=1), 1, atol=TOLERANCE)
-    else:
-        assert first.shape == (*secret.size[::-1], 3)
-        assert first.min() >= 0
-        assert first.max() <= 1
-    assert first.dtype == np.float32
-    for array in (*_arrays(mine), *cached):
+        assert estimate.shape == secret.descriptors.shape
+    elif isinstance(attack, ImageAttack):
+        assert estimate.shape == (*secret.size[::-1], 3)
+        assert estimate.min() >= 0
+        assert estimate.max() <= 1
+    if not isinstance(attack, ImageAttack):
+        np.testing.assert_allclose(np.linalg.norm(estimate, axis=1), 1, atol=TOLERANCE)
+    assert estimate.dtype == np.float32
+    for array in (*_arrays(mine), *quantised):
         array[...] = 0
     for entry in store.list_entries():
-        overwrite(entry.path, entry.kind)
+        if entry.kind not in (maps.KIND, dictionary.KIND):  # which hold public data alone
+            overwrite_with_zeros(entry.path, entry.kind)
     public.clear()
-    assert np.array_equal(first, _estimate(trial)), "the attack saw more than the release"
+    assert np.array_equal(estimate, _estimate(trial)), "the attack saw more than the release"
 
 
 def check_metric(metric: Metric, seed: int = 0) -> None:
@@ -149,7 +164,7 @@ def check_extractor(extractor: Extractor, image: np.ndarray, source: Path | None
     before = image.copy()
     features = extractor.extract(image, source)
     assert np.array_equal(image, before)
-    assert same(features, extractor.extract(image, source))
+    assert are_equal(features, extractor.extract(image, source))
     height, width = image.shape[:2]
     assert features.size == (width, height)
     assert len(features) > 0
@@ -157,11 +172,11 @@ def check_extractor(extractor: Extractor, image: np.ndarray, source: Path | None
     assert (features.keypoints >= 0).all()
     assert (features.keypoints <= features.size).all()
     np.testing.assert_allclose(np.linalg.norm(features.descriptors, axis=1), 1, atol=TOLERANCE)
-    assert features.codes is None or same_array(unit_rows(features.codes), features.descriptors)
-    assert same(features, features.by_position()), "the order of keypoints would tell what is not released"
+    assert features.codes is None or arrays_equal(unit_rows(features.codes), features.descriptors)
+    assert are_equal(features, features.by_position()), "the order of keypoints would tell what is not released"
 
 
-def overwrite(file: Path, kind: str) -> None:
+def overwrite_with_zeros(file: Path, kind: str) -> None:
     """Put zeros in the place of all numbers of a file of arrays, as if they were what had been written."""
     arrays, meta, _ = tensor_file.load(file, kind)
     tensor_file.save(file, kind, {name: np.zeros_like(array) for name, array in arrays.items()}, meta)
@@ -179,8 +194,8 @@ def check_task(task: Task, defense: Defense, extractor: Extractor, secret: Featu
 
     def judged() -> Outcome:
         trial = Trial(
-            sample=NO_SAMPLE,
-            images=(shot(secret, release),),
+            sample=EMPTY_SAMPLE,
+            images=(build_image(secret, release),),
             defense=defense,
             attack=None,
             extractor=extractor,
@@ -196,8 +211,8 @@ def check_task(task: Task, defense: Defense, extractor: Extractor, secret: Featu
     assert first.metrics, "judged nothing"
     assert all(value is None or (isinstance(value, float) and np.isfinite(value)) for value in first.metrics.values())
     assert first.metrics == judged().metrics, "the same rng gave another outcome"
-    assert same(secret, before), "changed the secret"
-    assert same(release, released), "changed the release"
+    assert are_equal(secret, before), "changed the secret"
+    assert are_equal(release, released), "changed the release"
 
 
 def check_dataset(dataset: Dataset) -> None:
@@ -218,27 +233,35 @@ def check_dataset(dataset: Dataset) -> None:
     assert len({image.pixels.content_hash() for image in images}) == len(images), "two images have one content hash"
 
 
-def same(one: Any, other: Any) -> bool:
+def are_equal(one: Any, other: Any) -> bool:
     """Whether two dataclasses of arrays are equal bit for bit."""
-    values = [(getattr(one, field.name), getattr(other, field.name)) for field in dataclasses.fields(one)]
-    return all(same_array(a, b) if isinstance(a, np.ndarray) else a == b for a, b in values)
+    if isinstance(one, np.ndarray):
+        return arrays_equal(one, other)
+    if dataclasses.is_dataclass(one):
+        return all(are_equal(getattr(one, field.name), getattr(other, field.name)) for field in dataclasses.fields(one))
+    return bool(one == other)
 
 
-def same_array(one: np.ndarray, other: np.ndarray) -> bool:
+def arrays_equal(one: np.ndarray, other: np.ndarray) -> bool:
     return one.dtype == other.dtype and np.array_equal(one, other)
 
 
 def _estimate(trial: Trial) -> Floats:
-    seen, rng = build_view(trial), np.random.default_rng(3)
+    """Return what the attack recovers: an image, or descriptors of all keypoints or of those that it selects."""
+    view, rng = build_view(trial), np.random.default_rng(3)
     if isinstance(trial.attack, DescriptorAttack):
-        return trial.attack.recover(seen, rng)
+        return trial.attack.recover(view, rng)
+    if isinstance(trial.attack, SelectiveAttack):
+        return trial.attack.select(view, rng).descriptors
     assert isinstance(trial.attack, ImageAttack)
-    return trial.attack.reconstruct(seen, rng)
+    return trial.attack.reconstruct(view, rng)
 
 
 def _arrays(value: Any) -> list[np.ndarray]:
-    found = [getattr(value, field.name) for field in dataclasses.fields(value)]
-    return [array for array in found if isinstance(array, np.ndarray)]
+    """Return the arrays of a dataclass, and of those in it."""
+    parts = [getattr(value, field.name) for field in dataclasses.fields(value)]
+    inner = [array for part in parts if dataclasses.is_dataclass(part) for array in _arrays(part)]
+    return [part for part in parts if isinstance(part, np.ndarray)] + inner
 
 
 def _shared(release: Release, secret: Features) -> bool:

@@ -19,8 +19,8 @@ mean direction of a public dictionary, and n is one less. It is a function of th
 
 The coin is exact, with q a multiple of 2^-64 (`bench.mechanisms.subset`). The vector is not: a sphere has no exact draw. γ and
 the projection are doubles, with a relative error of the densities of about 1e-12. Each component is rounded to a multiple of
-2^-12 before it is scaled to unit norm. This removes the bits in which sums of doubles reveal their summands (Mironov, CCS 2012). So ε
-holds as far as doubles represent real numbers, whereas mechanisms over words are exact.
+2^-12 before it is scaled to unit norm. This removes the bits in which sums of doubles reveal their summands (Mironov, CCS 2012).
+So ε holds as far as doubles represent real numbers, whereas mechanisms over words are exact.
 """
 
 from __future__ import annotations
@@ -33,8 +33,6 @@ from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize_scalar
-from scipy.special import betainc, betaincinv, betaln
 
 from bench.api import Defense, Privacy
 from bench.codebook.public import Public
@@ -99,6 +97,8 @@ def draw_near(u: Doubles, mean: Doubles | None, epsilon: float, rng: np.random.G
 
 def latitude(fraction: Doubles, length: int) -> Doubles:
     """The cosine with this fraction of S^(n − 1) beyond it: (1 + v·u) / 2 is Beta((n − 1)/2, (n − 1)/2). (N,) -> (N,)"""
+    from scipy.special import betaincinv
+
     half = (length - 1) / 2
     return 1 - 2 * betaincinv(half, half, fraction)
 
@@ -110,6 +110,9 @@ def choose_cap(epsilon: float, length: int) -> int:
     The part of v·u's mean beyond γ is c = (1 − γ²)^((n − 1)/2) / ((n − 1) B(1/2, (n − 1)/2)) under the uniform
     density, and the part before it −c. So the mean is c (e^ε − 1) / (q e^ε + 1 − q).
     """
+    from scipy.optimize import minimize_scalar
+    from scipy.special import betainc
+
     half = (length - 1) / 2
 
     def logarithm(gamma: float) -> float:
@@ -123,6 +126,8 @@ def choose_cap(epsilon: float, length: int) -> int:
 
 def expected_cosine(epsilon: float, length: int) -> float:
     """The mean of v·u."""
+    from scipy.special import betaln
+
     q, half = choose_cap(epsilon, length) / 2**BINARY_DIGITS, (length - 1) / 2
     gamma = float(latitude(np.array([q]), length)[0])
     beyond = half * math.log1p(-(gamma**2)) - math.log(2 * half) - betaln(0.5, half)

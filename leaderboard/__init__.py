@@ -1,1 +1,1 @@
-"""Everything a person sees, made from records alone."""
+"""Statistics, tables, plots and pages, from records alone."""

@@ -1,7 +1,7 @@
-"""What a service costs: operations, bytes and seconds of a query, from counts and from rates that are measured here.
+"""The cost of a service: operations, bytes and seconds of a query, from counts and from rates measured on this machine.
 
-Times are of one core (`time.process_time`, one thread), so that what else runs on the machine counts little, and add up to cores:
-seconds of a query times queries a day, divided by the seconds of a day.
+Times are of one core (`time.process_time`, one thread), so that other processes matter little. The number of cores is
+the seconds of a query times the queries per day, divided by the seconds of a day.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numpy as np
 
 from bench.api import Extractor, ImageAttack, View
 from bench.codebook.public import Public
+from bench.core.table import Table, build_table
 from bench.geometry.nearest_words import WordIndex
 from bench.geometry.subspaces import find_nearest_to_subspaces
 from bench.images import photographs
@@ -22,16 +23,17 @@ from bench.registry import discovery, spec
 from bench.tasks.reconstruction import offer_knowledge
 from bench.types import Features, Subspaces
 
+COLUMNS = ("who", "step", "operations", "bytes", "core seconds", "TB a day", "cores")
 DAY = 86_400  # seconds
 POSITION = 8  # bytes of two float32
-WORD = 4  # bytes of a word's number
+WORD = 4  # bytes of a word's index
 FLOAT = 4
-MIN_SECONDS = 0.2  # seconds that a rate is measured for, at least
+MIN_SECONDS = 0.2  # minimum time that a rate is measured for
 
 
 @dataclass(frozen=True, kw_only=True)
 class Service:
-    """Sizes. The defaults are the paper's, where it states them."""
+    """Sizes of a service. The defaults are the paper's, where it states them."""
 
     keypoints: int = 1000  # of an image; the paper does not say
     words: int = 256_000  # |K|
@@ -44,21 +46,21 @@ class Service:
 
 @dataclass(frozen=True, kw_only=True)
 class Rates:
-    """What one core does here."""
+    """Rates of one core of this machine."""
 
-    search: float  # operations a second of the search for the nearest word
-    subspaces: float  # operations a second of the search for the words nearest to subspaces
-    sets: float  # sets drawn a second
-    extraction: float  # seconds a photograph of 256 x 256
-    lifting: float  # seconds a keypoint
-    reconstruction: float  # seconds a photograph of 256 x 256
+    search: float  # operations per second of the search for the nearest word
+    subspaces: float  # operations per second of the search for the words nearest to subspaces
+    sets: float  # sets per second
+    extraction: float  # seconds per photograph of 256 x 256
+    lifting: float  # seconds per keypoint
+    reconstruction: float  # seconds per photograph of 256 x 256
 
 
 @dataclass(frozen=True, kw_only=True)
 class Cost:
-    """One step of a query; None where it has no such number."""
+    """One step of a query; None for numbers that do not apply."""
 
-    who: str
+    party: str
     step: str
     operations: float | None = None
     sent: int | None = None  # bytes
@@ -66,7 +68,7 @@ class Cost:
 
 
 def measure_rates(service: Service) -> Rates:
-    """Measure the rates on a photograph that scikit-image carries, with one thread. Takes seconds to a minute.
+    """Measure the rates on a photograph of scikit-image, with one thread. Takes up to a minute.
 
     Raises
     ------
@@ -118,43 +120,45 @@ def _time_reconstruction(secret: Features, extractor: Extractor, public: Public)
 
 
 def _time(work: Callable[[], object]) -> float:
-    """Of the processor, the shortest of several runs; the first, which may fill caches, does not count."""
+    """Return the shortest processor time of several runs, without the first, which may fill caches."""
     work()
-    taken: list[float] = []
-    while sum(taken) < MIN_SECONDS or len(taken) < 3:
+    times: list[float] = []
+    while sum(times) < MIN_SECONDS or len(times) < 3:
         started = time.process_time()
         work()
-        taken.append(time.process_time() - started)
-    return max(min(taken), 1e-9)
+        times.append(time.process_time() - started)
+    return max(min(times), 1e-9)
 
 
 def list_costs(service: Service, rates: Rates) -> Iterator[Cost]:
-    """The steps of one query, on the phone, on the way, on the server, and of an attacker."""
+    """Yield the steps of one query: on the phone, in transmission, on the server, and of an attacker."""
     n, d, m, dim = service.keypoints, service.length, service.subset_size, service.dim
     search = 2.0 * n * service.words * d
     matching = 2.0 * service.references * n * n * d
     attack = 2.0 * n * (dim + 1) * service.database * d
-    yield Cost(who="phone", step="extract SIFT, 256 x 256", seconds=rates.extraction)
-    yield Cost(who="phone", step="LDP-Feat: nearest words", operations=search, seconds=search / rates.search)
-    yield Cost(who="phone", step="LDP-Feat: draw sets", operations=float(n * m), seconds=n / rates.sets)
-    yield Cost(who="phone", step="affine: lift", seconds=n * rates.lifting)
-    yield Cost(who="sent", step="undefended, 8 bits a component", sent=n * (POSITION + d))
-    yield Cost(who="sent", step="LDP-Feat", sent=n * (POSITION + WORD * m))
-    yield Cost(who="sent", step="affine", sent=n * (POSITION + FLOAT * (dim + 1) * d))
-    yield Cost(who="server", step="match, undefended", operations=matching, seconds=matching / rates.search)
-    yield Cost(who="server", step="match, LDP-Feat: each candidate", operations=m * matching, seconds=m * matching / rates.search)
+    yield Cost(party="phone", step="extract SIFT, 256 x 256", seconds=rates.extraction)
+    yield Cost(party="phone", step="LDP-Feat: nearest words", operations=search, seconds=search / rates.search)
+    yield Cost(party="phone", step="LDP-Feat: draw sets", operations=float(n * m), seconds=n / rates.sets)
+    yield Cost(party="phone", step="affine: lift", seconds=n * rates.lifting)
+    yield Cost(party="sent", step="undefended, 8 bits a component", sent=n * (POSITION + d))
+    yield Cost(party="sent", step="LDP-Feat", sent=n * (POSITION + WORD * m))
+    yield Cost(party="sent", step="affine", sent=n * (POSITION + FLOAT * (dim + 1) * d))
+    yield Cost(party="server", step="match, undefended", operations=matching, seconds=matching / rates.search)
     yield Cost(
-        who="server", step="match, affine", operations=(dim + 1) * matching, seconds=(dim + 1) * matching / rates.subspaces
+        party="server", step="match, LDP-Feat: each candidate", operations=m * matching, seconds=m * matching / rates.search
     )
-    yield Cost(who="attacker", step="affine: words near subspaces", operations=attack, seconds=attack / rates.subspaces)
-    yield Cost(who="attacker", step="paint, 256 x 256, eight times", seconds=rates.reconstruction)
+    yield Cost(
+        party="server", step="match, affine", operations=(dim + 1) * matching, seconds=(dim + 1) * matching / rates.subspaces
+    )
+    yield Cost(party="attacker", step="affine: words near subspaces", operations=attack, seconds=attack / rates.subspaces)
+    yield Cost(party="attacker", step="reconstruct, 256 x 256, eight times", seconds=rates.reconstruction)
 
 
-def rows(service: Service, rates: Rates, queries: int) -> list[tuple[str, ...]]:
-    """Of each step: who, what, and operations, bytes and seconds of a query; then terabytes and cores of so many a day."""
-    return [
+def build_cost_table(service: Service, rates: Rates, queries: int) -> Table:
+    """Return a row for each step: operations, bytes and seconds of a query, then terabytes and cores of so many queries a day."""
+    rows = [
         (
-            cost.who,
+            cost.party,
             cost.step,
             "" if cost.operations is None else f"{cost.operations:.2g}",
             "" if cost.sent is None else f"{cost.sent:,}",
@@ -164,3 +168,5 @@ def rows(service: Service, rates: Rates, queries: int) -> list[tuple[str, ...]]:
         )
         for cost in list_costs(service, rates)
     ]
+    heading = f"A query of {service.keypoints} keypoints, and {queries:,} a day"
+    return build_table(COLUMNS, rows, text=COLUMNS[:2], heading=heading)

@@ -20,13 +20,13 @@ from leaderboard.tables import COMPOSITION_REMARK, SEED_REMARK, format_chance, f
 Value = Interval | float | int | str | None
 
 INTERVAL_REMARK = (
-    f"In brackets: {LEVEL:.0%} percentile bootstrap over the units; Wilson's interval where each unit did or did not succeed. "
-    "A single unit has none, nor has a median."
+    f"In brackets: {LEVEL:.0%} percentile bootstrap over the samples; Wilson's interval where each sample succeeds or fails. "
+    "A single sample has no interval, and a median has none."
 )
 NOT_APPLICABLE_REMARK = f"{NOT_APPLICABLE} without a note: that metric does not apply to what the attack recovers."
 RANK_REMARK = (
-    "Rank: by the strongest attack, the one with the greatest mean SSIM; the best in bold, of the ranked ones. A defense is "
-    "unranked, and stands at the end, without an attacker that was adapted to it, and if an attack has not done everything."
+    "Rank: by the strongest attack, the one with the greatest mean SSIM; the best of the ranked ones in bold. A defense is "
+    "unranked, and comes last, if no attacker was adapted to it, or if an attack has not completed all samples."
 )
 
 
@@ -108,7 +108,9 @@ def _build_columns(group: ComparisonGroup) -> tuple[GroupColumn, ...]:
         GroupColumn(name="epsilon_image", label="ε/image"),
         *attack,
         *(
-            GroupColumn(name=_join(measure.name, "_", condition), label=_join(measure.label, ", ", condition), better=measure.better)
+            GroupColumn(
+                name=_join(measure.name, "_", condition), label=_join(measure.label, ", ", condition), better=measure.better
+            )
             for measure, condition in _list_measured(group)
         ),
         GroupColumn(name="log10_true", label="Pr(true)"),

@@ -1,4 +1,4 @@
-"""What localization leaves for other programs: poses for Aachen's evaluation server, and what was retrieved, as hloc's pairs."""
+"""Localization results for other programs: poses for Aachen's evaluation server, and retrieved images as hloc's pairs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ESTIMATES = "estimates"
 
 
 def write(records: Iterable[Record], out: Path) -> Iterator[str]:
-    """Write into `out`, from records alone, and tell of each file in a line.
+    """Write the files into `out`, from records alone, and yield a line for each file.
 
     For each defense on Aachen `Aachen_eval_[method].txt`, without the queries that failed or were not localized, which are
     counted; and `pairs.txt`, or `pairs-[method].txt` for each defense where they differ.
@@ -30,39 +30,42 @@ def write(records: Iterable[Record], out: Path) -> Iterator[str]:
     OSError
         if a file cannot be written.
     """
-    cells: dict[str, list[Record]] = {}
+    experiments: dict[str, list[Record]] = {}
     for record in records:
         if record["task"] == "localization" and record["status"] != "n/a":
-            cells.setdefault(record["experiment_id"], []).append(record)
-    methods = _name_methods(list(cells.values()))
+            experiments.setdefault(record["experiment_id"], []).append(record)
+    methods = _name_methods(list(experiments.values()))
     retrieved = {
-        method: {record["sample"]: record[ESTIMATES]["retrieved"] for record in cell if ESTIMATES in record}
-        for method, cell in zip(methods, cells.values(), strict=True)
+        method: {record["sample"]: record[ESTIMATES]["retrieved"] for record in experiment if ESTIMATES in record}
+        for method, experiment in zip(methods, experiments.values(), strict=True)
     }
     if retrieved and len({str(each) for each in retrieved.values()}) == 1:
         retrieved = {"": next(iter(retrieved.values()))}
-    for method, listed in retrieved.items():
+    for method, by_query in retrieved.items():
         path = out / (f"pairs-{method}.txt" if method else "pairs.txt")
         try:
-            pairs.write(path, listed)
-        except UserError as error:  # a name with a space: hloc's format has no place for it
+            pairs.write(path, by_query)
+        except UserError as error:  # a name with a space, which hloc's format does not allow
             yield f"{path}: not written: {error}"
             continue
-        yield f"{path}: what was retrieved for {len(listed)} queries"
-    for method, cell in zip(methods, cells.values(), strict=True):
-        if cell[0]["dataset"]["name"] == "aachen":
-            poses = {record["sample"]: _read_pose(record) for record in cell}
-            path, left_out = aachen.write_evaluation(out, method, poses)
-            yield f"{path}: {len(poses) - left_out} poses; {left_out} queries that failed are left out"
+        yield f"{path}: what was retrieved for {len(by_query)} queries"
+    for method, experiment in zip(methods, experiments.values(), strict=True):
+        if experiment[0]["dataset"]["name"] == "aachen":
+            poses = {record["sample"]: _read_pose(record) for record in experiment}
+            path, missing = aachen.write_evaluation(out, method, poses)
+            yield f"{path}: {len(poses) - missing} poses; {missing} queries that failed are left out"
 
 
-def _name_methods(cells: list[list[Record]]) -> list[str]:
-    """A name for each cell that a file can have, each once."""
-    labels = tables.build_labels([(cell[0]["defense"], None) for cell in cells])
-    names = [re.sub(r"[^\w.+-]+", "_", f"{label}-seed{cell[0]['seed']}") for (label, _), cell in zip(labels, cells, strict=True)]
-    return [name if names.count(name) == 1 else f"{name}-{cell[0]['experiment_id']}" for name, cell in zip(names, cells, strict=True)]
+def _name_methods(experiments: list[list[Record]]) -> list[str]:
+    """Return a distinct file name for each experiment."""
+    first = [experiment[0] for experiment in experiments]
+    labels = tables.build_labels([(record["defense"], None) for record in first])
+    names = [re.sub(r"[^\w.+-]+", "_", f"{label}-seed{record['seed']}") for (label, _), record in zip(labels, first, strict=True)]
+    return [
+        name if names.count(name) == 1 else f"{name}-{record['experiment_id']}" for name, record in zip(names, first, strict=True)
+    ]
 
 
 def _read_pose(record: Record) -> pycolmap.Rigid3d | None:
-    found = record.get(ESTIMATES, {}).get("pose")
-    return None if found is None else lists.parse_pose([repr(value) for value in found], record["sample"])
+    pose = record.get(ESTIMATES, {}).get("pose")
+    return None if pose is None else lists.parse_pose([repr(value) for value in pose], record["sample"])

@@ -71,10 +71,10 @@ _TASK_MEASURES = (
         Measure(name, name.replace("_", " "), -1, "median", f"median over queries, in {unit}; ∞ if not localized")
         for name, unit in zip(MEDIAN_METRICS, ("scene units", "degrees"), strict=True)
     ),
-    Measure("precision", "precision", 1, "mean", "share of matches that are right"),
-    Measure("recall", "recall", 1, "mean", "share of right matches that are found"),
-    Measure("registered", "registered images", 1, "mean", "images of the scene that structure from motion could place"),
-    Measure("right_poses", "right poses", 1, "mean", "registered images within 5% of the place's extent and 5° of the truth"),
+    Measure("precision", "precision", 1, "mean", "fraction of matches that are right"),
+    Measure("recall", "recall", 1, "mean", "fraction of right matches that are found"),
+    Measure("registered", "registered images", 1, "mean", "images of the scene that structure from motion registered"),
+    Measure("right_poses", "right poses", 1, "mean", "registered images within 5% of the scene's extent and 5° of the truth"),
     Measure("points", "sparse points", 1, "mean", "points of the map"),
     Measure("track_length", "track length", 1, "mean", "images that see a point of the map"),
     Measure("reprojection_error", "reprojection error", -1, "mean", "in pixels"),
@@ -92,7 +92,7 @@ def _parse_measure(name: str) -> Measure:
     """Return the measure of a metric whose name states a threshold."""
     if match := re.fullmatch(r"recall_([\d.]+)m_([\d.]+)deg", name):
         metres, degrees = match.groups()
-        explanation = f"share of queries localized within {metres} m and {degrees}°, with Wilson's interval"
+        explanation = f"fraction of queries localized within {metres} m and {degrees}°, with Wilson's interval"
         return Measure(name, f"recall ({metres} m, {degrees}°)", 1, "fraction", explanation)
     if match := re.fullmatch(r"accuracy_([\d.]+)px", name):
         return Measure(name, f"accuracy ({match[1]} px)", 1, "mean", f"matching accuracy at {match[1]} pixels")

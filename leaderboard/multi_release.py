@@ -1,4 +1,4 @@
-"""The curve of repeated releases: how often the true word is told by T word sets, beside the bound that T ε sets."""
+"""The curve of repeated releases: how often T word sets reveal the true word, and the upper bound at T ε."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ if TYPE_CHECKING:
 
 
 def build_rows(epsilon: float, domain: int, size: int, releases: int) -> list[dict[str, Any]]:
-    """One row for each T = 1, ..., `releases`, of the ω-subset mechanism on |K| = `domain` words with m = `size`.
+    """Return a row for each T = 1, ..., `releases` of the ω-subset mechanism on |K| = `domain` words with m = `size`.
 
-    `success` is the chance that the word that most sets hold is the true one, `bound` the greatest that any guess can have at
+    `success` is the probability that the word in most sets is the true one, `bound` is the greatest probability of any guess at
     T ε, and `epsilon_total` is T ε.
     """
     chances = compute_success_chances(epsilon, domain, size, releases)
@@ -32,7 +32,7 @@ def build_rows(epsilon: float, domain: int, size: int, releases: int) -> list[di
 
 
 def draw(curve: list[dict[str, Any]]) -> Figure:
-    """Success and bound over T, of one setting."""
+    """Draw success and bound over T, for one setting."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(5.2, 3.4), layout="constrained", dpi=120)
@@ -40,12 +40,12 @@ def draw(curve: list[dict[str, Any]]) -> Figure:
     setting = curve[0]
     numbers = [row["releases"] for row in curve]
     axes.plot(numbers, [row["bound"] for row in curve], "k--", label=r"bound at $T\varepsilon$")
-    axes.plot(numbers, [row["success"] for row in curve], "o-", color="tab:blue", label="the word that most sets hold")
+    axes.plot(numbers, [row["success"] for row in curve], "o-", color="tab:blue", label="the word in most sets")
     axes.set_title(
         rf"ldp, $\varepsilon$ = {setting['epsilon']:g}, m = {setting['subset_size']}, |K| = {setting['words']:,}", fontsize=9
     )
     axes.set_xlabel("releases of the same features, T")
-    axes.set_ylabel("chance that the true word is told")
+    axes.set_ylabel("probability of the true word")
     axes.set_xticks(numbers)
     axes.set_ylim(0, 1.04)
     axes.grid(alpha=0.3)

@@ -40,7 +40,7 @@ def draw_plots(group: ComparisonGroup, tradeoffs: Sequence[Tradeoff]) -> Iterato
 
 
 def draw_tradeoff(tradeoff: Tradeoff) -> Figure:
-    """Draw each defense and setting, with utility to the right, what the strongest attack recovers upwards, and the Pareto front."""
+    """Draw each defense and setting: utility to the right, what the strongest attack recovers upwards, and the Pareto front."""
     figure, axes = _create_axes(7.2, 4.6, tradeoff.caption)
     for family, style in choose_family_styles(tradeoff).items():
         members = [point for point in tradeoff.points if point.standing.configuration["name"] == family]
@@ -159,7 +159,9 @@ def _create_axes(width: float, height: float, title: str) -> tuple[Figure, Axes]
     return figure, axes
 
 
-def _draw_points(axes: Axes, at: Sequence[tuple[Interval, Interval]], style: PlotStyle, *, filled: bool, label: str | None) -> None:
+def _draw_points(
+    axes: Axes, at: Sequence[tuple[Interval, Interval]], style: PlotStyle, *, filled: bool, label: str | None
+) -> None:
     """Draw the points, with thin lines for the intervals that are finite."""
     if not at:
         return

@@ -1,4 +1,4 @@
-"""The command that makes a cell again, from its records."""
+"""The command that repeats an experiment, from its records."""
 
 from __future__ import annotations
 
@@ -24,78 +24,80 @@ DEFAULT = {"--task": "reconstruction", "--extractor": "sift"}  # of the command 
 
 @dataclass(frozen=True)
 class Recipe:
-    """A line for a shell, and what it takes beside this program."""
+    """Lines for a shell, and the files that they need."""
 
     command: str
     needs: tuple[str, ...]
 
 
 def find_plugin(kind: Kind, name: str) -> type[Plugin] | None:
-    """The plugin of that name, if it is here."""
+    """Return the plugin of that name, or None if it is not installed."""
     try:
-        found: type[Plugin] = discovery.load_plugin(kind, name)
+        plugin: type[Plugin] = discovery.load_plugin(kind, name)
     except UserError:
         return None
-    return found
+    return plugin
 
 
-def build_recipe(cell: GroupedExperiment, lookup: Lookup = find_plugin) -> Recipe:
-    """`bench run` with all that the records say; files of the user's own stand there as FILE, and `needs` tells their digests.
+def build_recipe(experiment: GroupedExperiment, lookup: Lookup = find_plugin) -> Recipe:
+    """Return the `bench run` command of an experiment. The user's own files appear as FILE, and `needs` states their digests.
 
-    A plugin that is not installed here has all its recorded fields spelt out. Many cells share a cached `lookup`.
+    A plugin that is not installed has all its recorded fields. Many experiments can share a cached `lookup`.
     """
-    head, spec = cell.metadata, functools.partial(_write_spec, lookup)
+    metadata, spec = experiment.metadata, functools.partial(_write_spec, lookup)
     needs: dict[str, None] = {}
-    task = {"name": head["task"], **(head.get("task_settings") or {})}
+    task = {"name": metadata["task"], **(metadata.get("task_settings") or {})}
     options = [
         ("--task", spec(discovery.TASK, task, needs)),
-        ("--defense", spec(discovery.DEFENSE, head["defense"], needs, _find_scene_field(lookup, head))),
+        ("--defense", spec(discovery.DEFENSE, metadata["defense"], needs, _find_scene_field(lookup, metadata))),
     ]
-    if head["attack"] is not None:
-        options.append(("--attack", spec(discovery.ATTACK, head["attack"], needs)))
-    options.append(("--extractor", spec(discovery.EXTRACTOR, head["dataset"]["extractor"], needs)))
-    if head["dataset"].get("spec"):
-        options.append(("--dataset", spec(discovery.DATASET, head["dataset"]["spec"], needs)))
-    elif head["dataset"]["name"] != BUILTIN:
-        options.append(("--images", str(head["dataset"]["name"])))
-        needs[f"{head['dataset']['name']}: a folder of the photographs with the content {head['dataset']['hash']}"] = None
-    options += [("--metric", text) for text in _list_metrics(lookup, head["metric_settings"], needs)]
-    seeds = sorted({one.record["seed"] for one in cell.records})
+    if metadata["attack"] is not None:
+        options.append(("--attack", spec(discovery.ATTACK, metadata["attack"], needs)))
+    options.append(("--extractor", spec(discovery.EXTRACTOR, metadata["dataset"]["extractor"], needs)))
+    if metadata["dataset"].get("spec"):
+        options.append(("--dataset", spec(discovery.DATASET, metadata["dataset"]["spec"], needs)))
+    elif metadata["dataset"]["name"] != BUILTIN:
+        options.append(("--images", str(metadata["dataset"]["name"])))
+        needs[f"{metadata['dataset']['name']}: a folder of the photographs with the content {metadata['dataset']['hash']}"] = None
+    options += [("--metric", text) for text in _list_metrics(lookup, metadata["metric_settings"], needs)]
+    seeds = sorted({located.record["seed"] for located in experiment.records})
     words = ["bench run", *(_format_option(option, text) for option, text in options if DEFAULT.get(option) != text)]
     return Recipe("\n".join(" ".join([*words, f"--seed {seed}"]) for seed in seeds), tuple(needs))
 
 
 def _format_option(name: str, text: str) -> str:
-    """An option for a shell, whatever its value is."""
+    """Return an option, quoted for a shell."""
     return f"{name}{'=' if text.startswith('-') else ' '}{shlex.quote(text)}"
 
 
-def _find_scene_field(lookup: Lookup, head: Record) -> str | None:
-    """The field of the defense that is filled in with a dictionary of the place, if the task is about one."""
-    task, defense = lookup(discovery.TASK, head["task"]), lookup(discovery.DEFENSE, head["defense"]["name"])
-    about_places = task is not None and issubclass(task, Task) and task.needs_scene
-    return defense.dictionary_field if about_places and defense is not None and issubclass(defense, Defense) else None
+def _find_scene_field(lookup: Lookup, metadata: Record) -> str | None:
+    """Return the field of the defense that a task with a scene fills with a dictionary of that scene."""
+    task, defense = lookup(discovery.TASK, metadata["task"]), lookup(discovery.DEFENSE, metadata["defense"]["name"])
+    has_scene = task is not None and issubclass(task, Task) and task.needs_scene
+    return defense.dictionary_field if has_scene and defense is not None and issubclass(defense, Defense) else None
 
 
 def _list_metrics(lookup: Lookup, settings: Mapping[str, Mapping[str, Any]], needs: dict[str, None]) -> Iterator[str]:
-    """Those that are measured only where they are asked for."""
+    """Yield the metrics that are measured only on request."""
     for name, content in settings.items():
         plugin = lookup(discovery.METRIC, name)
         if plugin and fields.list_required(plugin):
             yield _write_spec(lookup, discovery.METRIC, {"name": name, **content}, needs)
 
 
-def _write_spec(lookup: Lookup, kind: Kind, configuration: Mapping[str, Any], needs: dict[str, None], made: str | None = None) -> str:
-    """A plugin as the command line takes it, without the fields that are as by default; `made` is one that it fills in."""
+def _write_spec(
+    lookup: Lookup, kind: Kind, configuration: Mapping[str, Any], needs: dict[str, None], scene_field: str | None = None
+) -> str:
+    """Return a plugin's specification without default fields. The command itself fills `scene_field`."""
     plugin = lookup(kind, configuration["name"])
     defaults = fields.list_defaults(plugin) if plugin else {}
     given = []
     for field, value in configuration.items():
         if field == "name" or isinstance(value, dict) or (plugin and field not in fields.resolve_types(plugin)):
-            continue  # what other plugins do in its stead is no field
+            continue  # settings of nested plugins are no fields
         text = _format_value(value)
-        if field == made and text == "FILE":
-            needs[f"{field} of {configuration['name']} is made from the references of the place, or was a file: {value}"] = None
+        if field == scene_field and text == "FILE":
+            needs[f"{field} of {configuration['name']} is made from the references of the scene, or was a file: {value}"] = None
         elif field not in defaults or text != _format_value(defaults[field]):
             given.append(f"{field}={text}")
             if text == "FILE":
@@ -115,13 +117,13 @@ def _format_value(value: Any) -> str:
 
 @functools.cache
 def _index_shipped() -> dict[str, str]:
-    """Digest of each file that is part of this installation -> the name that a field gives it."""
+    """Return the digest of each installed file, with the name that a field uses for it."""
     names = {file: name for name, file in SHIPPED.items()}
     return {digest: names.get(file, "shipped") for file, digest in _read_digests()}
 
 
 def _read_digests() -> Iterator[tuple[str, str]]:
-    """From the files' headers, without the rest of them."""
+    """Yield name and digest of each shipped file, from its header."""
     from safetensors import safe_open
 
     for path in sorted(ASSETS.glob("*.safetensors")):

@@ -1,14 +1,15 @@
-"""Results against a baseline, cell by cell: what got better, what got worse, and what is no longer there.
+"""Regression check: results against a baseline, one experiment at a time.
 
-Cells belong together if their configurations and inputs are equal but for the seed. Units, such as photographs, are paired, and a
-unit counts with its mean over the seeds. A mean difference over the units is told from chance by a tolerance,
+Experiments match if their configurations and inputs are equal except for the seed. Samples such as photographs are paired, and a
+sample counts with its mean over the seeds. A mean difference over the samples is significant if it exceeds the tolerance
 
-    max(floor, t · s · sqrt(Σ_u (1/n_u + 1/n'_u)) / U)
+    max(minimum, t · s · sqrt(Σ_u (1/n_u + 1/n'_u)) / U)
 
-where s² is the variance from seed to seed within units, pooled over the units of both sides, n_u and n'_u are the seeds that a
-unit has on either side, U counts the units, and t is the quantile of Student's distribution, for s's degrees of freedom, that
-chance passes once in a thousand comparisons. Of one seed a side there is no such spread; then it is the bootstrap over the units
-of the paired differences, at the same level. The floor is what a number may move between machines and versions of libraries.
+where s² is the variance from seed to seed within samples, pooled over the samples of both sides, n_u and n'_u are the seeds of
+sample u on either side, and U counts the samples. t is the quantile of Student's distribution, for s's degrees of freedom, that
+chance exceeds once in a thousand comparisons. With one seed on each side there is no such variance; then the tolerance is the
+bootstrap over the samples of the paired differences, at the same level. The minimum is what a number may move between machines
+and versions of libraries.
 """
 
 from __future__ import annotations
@@ -28,145 +29,152 @@ from leaderboard.intervals import interval
 from leaderboard.measures import list_measures
 from leaderboard.tables import build_labels
 
-Verdict = Literal["worse", "weaker", "missing", "better", "new", "same"]  # the gravest first
+Verdict = Literal["worse", "weaker", "missing", "better", "new", "same"]  # the most severe first
 CONFIDENCE = 0.999
-# Eight times what bf16 in the place of float32 made of the shipped networks: 0.12% at most, of means over seven photographs.
+# Eight times the effect of bf16 instead of float32 on the shipped networks: 0.12% at most, of means over seven photographs.
 RELATIVE_TOLERANCE = 0.01  # of the baseline's mean
 ABSOLUTE_TOLERANCE = 0.001  # in the metric's unit
 GUARANTEE = "epsilon_descriptor"
 
-SampleValues = Mapping[str, Sequence[float]]  # unit -> its values, one a seed
+SampleValues = Mapping[str, Sequence[float]]  # sample -> its values, one per seed
+SampleRecords = Mapping[str, list[Record]]  # sample -> its completed records
 
 
 @dataclass(frozen=True, kw_only=True)
 class RegressionResult:
-    """One metric of one cell, or the whole cell where `metric` is empty."""
+    """The comparison of one metric of an experiment, or of the whole experiment where `metric` is empty."""
 
     verdict: Verdict
     defense: str  # labels
     attack: str
     metric: str = ""
-    before: float = math.nan  # means over the units that both have
+    before: float = math.nan  # means over the samples that both sides have
     after: float = math.nan
-    compute_tolerance: float = math.nan
-    note: str = ""  # what a reader should know of it
+    tolerance: float = math.nan
+    note: str = ""
 
 
 def compare(baseline: Iterable[Record], results: Iterable[Record]) -> list[RegressionResult]:
-    """Every metric that has a better and a worse, of every cell that either side has, the gravest findings first.
+    """Compare every judged metric of every experiment that either side has. Returns the most severe results first.
 
-    An attacker who recovers less of the same defense, its source being what it was, is a `weaker` attack: no defense gets better
-    by that. Where records do not tell the source, it is taken to be the same.
+    If an attacker recovers less of a defense whose source is unchanged, the verdict is `weaker`, for the attack: no defense gets
+    better by that. Where records lack the source, it counts as unchanged.
     """
     before, after = _group_experiments(baseline), _group_experiments(results)
-    heads = [(cells[0]["defense"], cells[0]["attack"]) for cells in {**after, **before}.values()]
-    names = dict(zip({**after, **before}, build_labels(heads), strict=True))
-    found: list[RegressionResult] = []
-    for key, (defense, attack) in names.items():
-        finding = functools.partial(RegressionResult, defense=defense, attack=attack)
+    experiments = {**after, **before}
+    labels = build_labels([(records[0]["defense"], records[0]["attack"]) for records in experiments.values()])
+    comparisons: list[RegressionResult] = []
+    for key, (defense, attack) in zip(experiments, labels, strict=True):
+        build = functools.partial(RegressionResult, defense=defense, attack=attack)
         if key not in after:
-            found.append(finding(verdict="missing", note="no results for this cell of the baseline"))
+            comparisons.append(build(verdict="missing", note="no results for this experiment of the baseline"))
         elif key not in before:
-            found.append(finding(verdict="new", note="the baseline does not have this cell"))
+            comparisons.append(build(verdict="new", note="the baseline does not have this experiment"))
         else:
-            found += _compare_experiment(before[key], after[key], finding)
+            comparisons += _compare_experiment(before[key], after[key], build)
     order = Verdict.__args__  # type: ignore[attr-defined]
-    return sorted(found, key=lambda one: order.index(one.verdict))
+    return sorted(comparisons, key=lambda result: order.index(result.verdict))
 
 
-def compute_tolerance(before: SampleValues, after: SampleValues, floor: float) -> float:
-    """How far the means of two sides may be apart, by the rule at the top of this file. Both have the same units, at least one.
+def compute_tolerance(before: SampleValues, after: SampleValues, minimum: float) -> float:
+    """Return how far the means of two sides may differ, by the rule at the top of this file.
 
-    One unit under one seed has no spread to be seen; there the floor alone decides.
+    Both sides have the same samples, at least one. One sample under one seed has no variance; there the minimum alone decides.
     """
-    sides = [[np.asarray(side[unit], np.float64) for unit in before] for side in (before, after)]
-    samples = [sample for side in sides for sample in side]
-    freedom = sum(len(sample) - 1 for sample in samples)
+    sides = [[np.asarray(side[sample], np.float64) for sample in before] for side in (before, after)]
+    values = [sample for side in sides for sample in side]
+    freedom = sum(len(sample) - 1 for sample in values)
     if freedom > 0:
-        variance = sum(float(np.square(sample - sample.mean()).sum()) for sample in samples) / freedom
-        error = math.sqrt(variance * sum(1 / len(sample) for sample in samples)) / len(before)
-        return max(floor, float(stats.t.ppf((1 + CONFIDENCE) / 2, freedom)) * error)
+        variance = sum(float(np.square(sample - sample.mean()).sum()) for sample in values) / freedom
+        error = math.sqrt(variance * sum(1 / len(sample) for sample in values)) / len(before)
+        return max(minimum, float(stats.t.ppf((1 + CONFIDENCE) / 2, freedom)) * error)
     differences = [float(new[0] - old[0]) for old, new in zip(*sides, strict=True)]
     if len(differences) == 1:
-        return floor
+        return minimum
     likely = interval(differences, CONFIDENCE)
-    return max(floor, likely.high - likely.mean, likely.mean - likely.low)
+    return max(minimum, likely.high - likely.mean, likely.mean - likely.low)
 
 
 def _group_experiments(records: Iterable[Record]) -> dict[str, list[Record]]:
-    """The latest record of each unit and seed, by what all of a cell share but the seed."""
+    """Return the latest record of each sample and seed, by what the records of an experiment share except for the seed."""
     latest = {(record["experiment_id"], record["sample"]): record for record in records}
-    cells: dict[str, list[Record]] = {}
+    experiments: dict[str, list[Record]] = {}
     for record in latest.values():
-        cells.setdefault(_experiment_key(record), []).append(record)
-    return cells
+        experiments.setdefault(_experiment_key(record), []).append(record)
+    return experiments
 
 
 def _experiment_key(record: Record) -> str:
-    """What `cell_id` hashes, without the seed; and without the metrics' settings, so that one more metric makes no other cell."""
+    """Return what `experiment_id` hashes, without the seed and the metrics' settings: a new metric does not change the key."""
     dataset = {name: value for name, value in record["dataset"].items() if name not in ("name", "spec")}
     parts = ("schema", "task", "task_settings", "defense", "attack")
     return canonical_json([dataset, *(record.get(part) for part in parts)])
 
 
-def _compare_experiment(before: list[Record], after: list[Record], finding: functools.partial[RegressionResult]) -> Iterator[RegressionResult]:
-    had, have = _group_completed(before), _group_completed(after)
-    lost = sorted(had.keys() - have.keys())
+def _compare_experiment(
+    before: list[Record], after: list[Record], build: functools.partial[RegressionResult]
+) -> Iterator[RegressionResult]:
+    old, new = _group_completed(before), _group_completed(after)
+    lost = sorted(old.keys() - new.keys())
     if lost:
         reasons = {record["sample"]: record["reason"] for record in after if record["status"] != "ok"}
-        told = f"{len(lost)} of {len(had)} units: {lost[0]}" + (f": {reason}" if (reason := reasons.get(lost[0])) else "")
-        yield finding(verdict="missing", note=told)
-    shared = [unit for unit in had if unit in have]
+        reason = f": {reasons[lost[0]]}" if reasons.get(lost[0]) else ""
+        yield build(verdict="missing", note=f"{len(lost)} of {len(old)} samples: {lost[0]}{reason}")
+    shared = [sample for sample in old if sample in new]
     if not shared:
         return
-    attacked = before[0]["attack"] is not None
+    has_attack = before[0]["attack"] is not None
     changed = [part for part in ("defense", "attack") if _get_source(before, part) != _get_source(after, part)]
-    for metric in list_measures(sorted({name for unit in shared for record in had[unit] for name in record["metrics"]})):
-        old, new = (_collect_values(side, shared, metric.name) for side in (had, have))
-        units = [unit for unit in old if unit in new]
-        if metric.better == 0 or not units:
+    names = sorted({name for sample in shared for record in old[sample] for name in record["metrics"]})
+    for metric in list_measures(names):
+        old_values, new_values = (_collect_values(side, shared, metric.name) for side in (old, new))
+        samples = [sample for sample in old_values if sample in new_values]
+        if metric.better == 0 or not samples:
             continue
         if _get_settings(before, metric.name) != _get_settings(after, metric.name):
-            yield finding(verdict="missing", metric=metric.name, note="it is measured with other settings")
+            yield build(verdict="missing", metric=metric.name, note="it is measured with other settings")
             continue
-        old, new = ({unit: side[unit] for unit in units} for side in (old, new))
-        first, second = _mean(old), _mean(new)
-        allowed = compute_tolerance(old, new, ABSOLUTE_TOLERANCE + RELATIVE_TOLERANCE * abs(first))
-        verdict = _judge(metric.better * (second - first), allowed, attacked, changed)
-        told = _explain(verdict, attacked, changed)
-        yield finding(verdict=verdict, metric=metric.name, before=first, after=second, tolerance=allowed, note=told)
-    yield from _compare_guarantee(had, have, shared, finding)
+        old_values, new_values = ({sample: side[sample] for sample in samples} for side in (old_values, new_values))
+        first, second = _mean(old_values), _mean(new_values)
+        tolerance = compute_tolerance(old_values, new_values, ABSOLUTE_TOLERANCE + RELATIVE_TOLERANCE * abs(first))
+        verdict = _judge(metric.better * (second - first), tolerance, has_attack, changed)
+        note = _explain(verdict, has_attack, changed)
+        yield build(verdict=verdict, metric=metric.name, before=first, after=second, tolerance=tolerance, note=note)
+    yield from _compare_guarantee(old, new, shared[0], build)
 
 
 def _compare_guarantee(
-    had: Mapping[str, list[Record]], have: Mapping[str, list[Record]], shared: Sequence[str], finding: functools.partial[RegressionResult]
+    before: SampleRecords, after: SampleRecords, sample: str, build: functools.partial[RegressionResult]
 ) -> Iterator[RegressionResult]:
-    """What is promised of a descriptor: it has no spread, and no tolerance."""
-    old, new = (side[shared[0]][0]["privacy"] for side in (had, have))
+    """Compare the guarantee of a descriptor, which has no variance and no tolerance."""
+    old, new = (side[sample][0]["privacy"] for side in (before, after))
     first, second = (math.inf if side[GUARANTEE] is None else float(side[GUARANTEE]) for side in (old, new))
     if first == second and old["guarantee"] == new["guarantee"]:
         return
     verdict: Verdict = "better" if second < first else "worse"
-    told = f"the guarantee was {old['guarantee']}, and is {new['guarantee']}"
-    yield finding(verdict=verdict, metric=GUARANTEE, before=first, after=second, tolerance=0.0, note=told)
+    note = f"the guarantee was {old['guarantee']}, and is {new['guarantee']}"
+    yield build(verdict=verdict, metric=GUARANTEE, before=first, after=second, tolerance=0.0, note=note)
 
 
 def _group_completed(records: Iterable[Record]) -> dict[str, list[Record]]:
-    done: dict[str, list[Record]] = {}
+    completed: dict[str, list[Record]] = {}
     for record in records:
         if record["status"] == "ok":
-            done.setdefault(record["sample"], []).append(record)
-    return done
+            completed.setdefault(record["sample"], []).append(record)
+    return completed
 
 
-def _collect_values(side: Mapping[str, list[Record]], units: Iterable[str], metric: str) -> dict[str, list[float]]:
-    """The known values of each unit that has any."""
-    found = {unit: [value for record in side[unit] if (value := record["metrics"].get(metric)) is not None] for unit in units}
-    return {unit: values for unit, values in found.items() if values}
+def _collect_values(records: SampleRecords, samples: Iterable[str], metric: str) -> dict[str, list[float]]:
+    """Return the values of a metric for each sample that has any."""
+    values = {
+        sample: [value for record in records[sample] if (value := record["metrics"].get(metric)) is not None]
+        for sample in samples
+    }
+    return {sample: known for sample, known in values.items() if known}
 
 
-def _mean(side: SampleValues) -> float:
-    return float(np.mean([np.mean(values) for values in side.values()]))
+def _mean(values: SampleValues) -> float:
+    return float(np.mean([np.mean(of_sample) for of_sample in values.values()]))
 
 
 def _get_source(records: Sequence[Record], part: str) -> Any:
@@ -177,19 +185,19 @@ def _get_settings(records: Sequence[Record], metric: str) -> Any:
     return (records[-1].get("metric_settings") or {}).get(metric)
 
 
-def _judge(gain: float, allowed: float, attacked: bool, changed: Sequence[str]) -> Verdict:
-    """`gain` is in the defender's favour."""
-    if abs(gain) <= allowed:
+def _judge(gain: float, tolerance: float, has_attack: bool, changed: Sequence[str]) -> Verdict:
+    """Return the verdict on a change; a positive `gain` favours the defender."""
+    if abs(gain) <= tolerance:
         return "same"
     if gain < 0:
         return "worse"
-    return "weaker" if attacked and "defense" not in changed else "better"
+    return "weaker" if has_attack and "defense" not in changed else "better"
 
 
-def _explain(verdict: Verdict, attacked: bool, changed: Sequence[str]) -> str:
+def _explain(verdict: Verdict, has_attack: bool, changed: Sequence[str]) -> str:
     if verdict == "weaker":
-        return "the attacker recovers less of a defense whose source is what it was"
-    if verdict == "worse" and attacked:
-        blamed = " and ".join(changed)
-        return f"the attacker recovers more; the source of the {blamed} is another" if blamed else "the attacker recovers more"
+        return "the attacker recovers less of a defense whose source is unchanged"
+    if verdict == "worse" and has_attack:
+        parts = " and ".join(changed)
+        return f"the attacker recovers more; the source of the {parts} changed" if parts else "the attacker recovers more"
     return "a server can do less" if verdict == "worse" else ""

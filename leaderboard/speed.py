@@ -1,9 +1,8 @@
-"""Speed, as ratios of times within one run of pytest-benchmark, against ratios that were found good.
+"""Speed: ratios of times within one run of pytest-benchmark, compared with ratios of a reference run.
 
-A time means little on another machine, and so does a ratio of two machines' times. A group of benchmarks holds floors, such as a
-bare product of matrices or another library's search, and the others are divided by the quickest of them, which is another one on
-another processor. pytest-benchmark compares times with those of earlier runs (`--benchmark-compare`), and knows no ratios within
-a run.
+Times of two machines cannot be compared. A group of benchmarks holds floors, such as a bare product of matrices or another
+library's search, and the others are divided by the fastest floor, which differs between processors. pytest-benchmark compares
+times with those of earlier runs (`--benchmark-compare`), but no ratios within a run.
 """
 
 from __future__ import annotations
@@ -17,60 +16,60 @@ from typing import Any
 from bench.core.errors import UserError
 from leaderboard.regression import RegressionResult, Verdict
 
-TOLERANCE = 2.0  # times as much as the baseline: what a busy machine makes of it is less
-FLOORS = ("bare_product", "random words", "faiss")  # in the names of benchmarks that others are divided by
+TOLERANCE = 2.0  # factor; a busy machine causes less
+FLOORS = ("bare_product", "random words", "faiss")  # in the names of the benchmarks that others are divided by
 
 Ratios = Mapping[str, float]
 
 
 def load_ratios(path: Path) -> Ratios:
-    """The committed ratios, by benchmark.
+    """Return the committed ratios, by benchmark.
 
     Raises
     ------
     UserError
         if the file is missing, or holds something else.
     """
-    found = _load_json(path)
-    if not isinstance(found, dict) or not all(isinstance(value, (int, float)) for value in found.values()):
+    content = _load_json(path)
+    if not isinstance(content, dict) or not all(isinstance(value, (int, float)) for value in content.values()):
         raise UserError(f"{path}: expected ratios, a number for each benchmark's name")
-    return found
+    return content
 
 
 def compute_ratios(path: Path) -> Ratios:
-    """Shortest time of each benchmark, divided by that of its group's quickest floor, from what `--benchmark-json` wrote.
+    """Return the shortest time of each benchmark divided by that of its group's fastest floor, from a `--benchmark-json` file.
 
     Raises
     ------
     UserError
         if the file is missing, or holds something else.
     """
-    found = _load_json(path)
-    if not isinstance(found, dict) or "benchmarks" not in found:
+    content = _load_json(path)
+    if not isinstance(content, dict) or "benchmarks" not in content:
         raise UserError(f"{path}: not what pytest --benchmark-json wrote")
     groups: dict[str, dict[str, float]] = {}
-    for one in found["benchmarks"]:
-        groups.setdefault(str(one["group"]), {})[one["name"]] = one["stats"]["min"]
-    measured: dict[str, float] = {}
+    for benchmark in content["benchmarks"]:
+        groups.setdefault(str(benchmark["group"]), {})[benchmark["name"]] = benchmark["stats"]["min"]
+    ratios: dict[str, float] = {}
     for group, times in groups.items():
         floors = [time for name, time in times.items() if _is_floor(name)]
         if floors:
-            measured |= {f"{group}: {name}": time / min(floors) for name, time in times.items() if not _is_floor(name)}
-    return measured
+            ratios |= {f"{group}: {name}": time / min(floors) for name, time in times.items() if not _is_floor(name)}
+    return ratios
 
 
 def compare(baseline: Ratios, measured: Ratios) -> list[RegressionResult]:
-    """A finding for each benchmark of either side."""
+    """Compare each benchmark of either side."""
     return [_compare_ratio(name, baseline.get(name), measured.get(name)) for name in sorted({*baseline, *measured})]
 
 
 def _compare_ratio(name: str, before: float | None, after: float | None) -> RegressionResult:
-    finding = functools.partial(RegressionResult, defense=name, attack="its floor")
+    build = functools.partial(RegressionResult, defense=name, attack="its floor")
     if before is None or after is None:
-        return finding(verdict="new" if before is None else "missing")
+        return build(verdict="new" if before is None else "missing")
     verdict: Verdict = "worse" if after > before * TOLERANCE else "better" if after < before / TOLERANCE else "same"
     allowed = before * (TOLERANCE - 1)
-    return finding(verdict=verdict, metric="time", before=before, after=after, tolerance=allowed)
+    return build(verdict=verdict, metric="time", before=before, after=after, tolerance=allowed)
 
 
 def _is_floor(name: str) -> bool:

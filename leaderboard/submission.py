@@ -1,7 +1,7 @@
-"""Somebody's records, checked: whether they are whole, say what they hash, are possible, and come out again.
+"""Checks submitted records: schema, hashes, consistency with a new plan, and whether a sample of them can be reproduced.
 
-A sample of them is made again here. Attacks then run in a process that never holds the secret (`bench.runner.attack_process`), so that one
-which looked at what it must not see cannot repeat its numbers.
+A sample of the records is computed again. Attacks then run in a process that never holds the secret
+(`bench.runner.attack_process`), so that an attack that read the secret cannot repeat its numbers.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ from leaderboard.regression import ABSOLUTE_TOLERANCE, RELATIVE_TOLERANCE
 P = TypeVar("P", bound=Plugin)
 
 SCHEMAS = {1: ASSETS / "record.schema.json", records.SCHEMA: ASSETS / "record-2.schema.json"}
-BUILTIN = "builtin"  # the photographs that everyone has
-MAX_LENGTH = 160  # characters of a complaint about what is in a line
-ROUNDING = 1e-9  # relative, between computers, of what follows from the configuration alone
+BUILTIN = "builtin"  # the photographs of every installation
+MAX_LENGTH = 160  # characters of a value in a message
+ROUNDING = 1e-9  # relative difference between computers of numbers that follow from the configuration alone
 
 
 @dataclass(frozen=True, order=True)
 class Fault:
-    """What is wrong with a line, counted from 1."""
+    """An error in a line, counted from 1."""
 
     line: int
     message: str
@@ -51,7 +51,7 @@ class Fault:
 
 @dataclass(frozen=True, eq=False)
 class NumberedRecord:
-    """A record that keeps the schema, and where it stands."""
+    """A record that follows the schema, and the number of its line."""
 
     number: int
     record: Record
@@ -60,13 +60,13 @@ class NumberedRecord:
 def check(
     path: Path, *, images: Path | None = None, files: Sequence[Path] = (), sample: int = 3, seed: int = 0
 ) -> tuple[int, list[Fault]]:
-    """How many lines there are, and what is wrong with them.
+    """Return the number of lines, and their faults.
 
     Parameters
     ----------
-    images : the photographs that were used, if they are not the built-in ones
-    files : dictionaries and networks that the records know by digest
-    sample : records to make again
+    images : the photographs, if they are not the built-in ones
+    files : dictionaries and networks that the records name by digest
+    sample : number of records to compute again
     seed : of the sample
 
     Raises
@@ -78,25 +78,24 @@ def check(
         raise UserError(f"{path}: no such file")
     texts = path.read_bytes().split(b"\n")
     texts = texts[:-1] if not texts[-1] else texts
-    here = _LocalInputs(images, files)
-    read = list(_parse_lines(texts))
-    format_faults = [one for one in read if isinstance(one, NumberedRecord)]
-    found = [one for one in read if isinstance(one, Fault)]
-    found += [Fault(line.number, what) for line in format_faults for what in _check_consistency(line.record)]
-    found += _find_duplicates(format_faults)
-    planned = [part for group in _rebuild_plans(format_faults, here) for part in group]
-    found += [part for part in planned if isinstance(part, Fault)]
-    cells = [part for part in planned if not isinstance(part, Fault)]
-    for _, cell, members, plan in cells:
-        found += _check_experiment(cell, members, plan)
-    done = [(plan, cell, line) for _, cell, members, plan in cells for line in members if line.record["status"] == "ok"]
-    found += _repeat_sample(done, sample, seed)
+    parsed = list(_parse_lines(texts))
+    lines = [one for one in parsed if isinstance(one, NumberedRecord)]
+    faults = [one for one in parsed if isinstance(one, Fault)]
+    faults += [Fault(line.number, message) for line in lines for message in _check_consistency(line.record)]
+    faults += _find_duplicates(lines)
+    planned = list(_rebuild_plans(lines, _LocalInputs(images, files)))
+    faults += [one for one in planned if isinstance(one, Fault)]
+    completed = []
+    for experiment, members, plan in (one for one in planned if not isinstance(one, Fault)):
+        faults += _check_experiment(experiment, members, plan)
+        completed += [(plan, experiment, line) for line in members if line.record["status"] == "ok"]
+    faults += _repeat_sample(completed, sample, seed)
     if not texts:
-        found.append(Fault(1, "there is no record"))
-    return len(texts), sorted(set(found))
+        faults.append(Fault(1, "there is no record"))
+    return len(texts), sorted(set(faults))
 
 
-# ---- a line by itself
+# ---- single lines
 
 
 def _parse_lines(texts: Sequence[bytes]) -> Iterator[NumberedRecord | Fault]:
@@ -113,12 +112,13 @@ def _parse_lines(texts: Sequence[bytes]) -> Iterator[NumberedRecord | Fault]:
             continue
         version = record.get("schema") if isinstance(record, dict) else None
         validator = validators[version if version == 1 else records.SCHEMA]
-        wrong = sorted(validator.iter_errors(record), key=lambda error: error.json_path)
-        for fault in wrong:
-            yield Fault(number, f"{fault.json_path.removeprefix('$').lstrip('.') or 'the record'}: {_shorten(fault.message)}")
-        if not wrong and (unbounded := _find_non_finite(record)):
+        errors = sorted(validator.iter_errors(record), key=lambda error: error.json_path)
+        for violation in errors:
+            part = violation.json_path.removeprefix("$").lstrip(".") or "the record"
+            yield Fault(number, f"{part}: {_shorten(violation.message)}")
+        if not errors and (unbounded := _find_non_finite(record)):
             yield Fault(number, f"{unbounded}: not finite")
-        elif not wrong:
+        elif not errors:
             if (fault := records.explain_invalid(record)) is not None:
                 yield Fault(number, fault)
             yield NumberedRecord(number, records.upgrade(record))
@@ -129,20 +129,20 @@ def _refuse(constant: str) -> None:
 
 
 def _find_non_finite(value: Any, path: str = "") -> str | None:
-    """Where a number lies that JSON can write and no double can hold, such as 1e999."""
+    """Return the path of a number that JSON can write and no double can hold, such as 1e999."""
     if isinstance(value, dict):
-        return next((found for name, inner in value.items() if (found := _find_non_finite(inner, f"{path}.{name}"))), None)
+        return next((part for name, inner in value.items() if (part := _find_non_finite(inner, f"{path}.{name}"))), None)
     return path.lstrip(".") if isinstance(value, float) and not math.isfinite(value) else None
 
 
 def _check_consistency(record: Record) -> Iterator[str]:
-    """Hashes that are not those of what they stand for, and metrics out of their range."""
+    """Yield hashes that do not match their content, and metrics outside of their range."""
     task = {"name": record["task"], **record["task_settings"]}
     configured = (task, record["defense"], record["attack"], record["dataset"], record["seed"], record["metric_settings"])
-    if (right := records.experiment_id(*configured)) != record["experiment_id"]:
-        yield f"experiment_id: is {record['experiment_id']}, but that of this configuration is {right}"
-    if (right := records.run_hash(record["experiment_id"], record["environment"])) != record["run_hash"]:
-        yield f"run_hash: is {record['run_hash']}, but that of this experiment and environment is {right}"
+    if (expected := records.experiment_id(*configured)) != record["experiment_id"]:
+        yield f"experiment_id: is {record['experiment_id']}, but that of this configuration is {expected}"
+    if (expected := records.run_hash(record["experiment_id"], record["environment"])) != record["run_hash"]:
+        yield f"run_hash: is {record['run_hash']}, but that of this experiment and environment is {expected}"
     known = {metric.name(): metric for metric in discovery.load_plugins(discovery.METRIC)}
     for name, value in record["metrics"].items():
         if name in known and value is not None and not known[name].range[0] <= value <= known[name].range[1]:
@@ -152,34 +152,34 @@ def _check_consistency(record: Record) -> Iterator[str]:
         yield "privacy.keypoints: not the keypoints of metrics"
 
 
-def _find_duplicates(format_faults: Sequence[NumberedRecord]) -> Iterator[Fault]:
-    """A unit of a cell that stands there twice; one that had failed may have been done again."""
+def _find_duplicates(lines: Sequence[NumberedRecord]) -> Iterator[Fault]:
+    """Yield samples of an experiment that occur twice; a failed one may occur again."""
     seen: dict[tuple[str, str], NumberedRecord] = {}
-    for line in format_faults:
+    for line in lines:
         key = line.record["experiment_id"], line.record["sample"]
         if key in seen and seen[key].record["status"] != "failed":
-            yield Fault(line.number, f"the same unit of the same cell as line {seen[key].number}")
+            yield Fault(line.number, f"the same sample of the same experiment as line {seen[key].number}")
         seen[key] = line
 
 
-# ---- cells, planned again from their configurations
+# ---- experiments, planned again from their configurations
 
 
 class _LocalInputs:
-    """What there is on this machine to plan with."""
+    """The photographs and files of this machine."""
 
     def __init__(self, images: Path | None, files: Sequence[Path]) -> None:
         self.images = None if images is None else list_photographs(images)
         shipped = {_read_digest(ASSETS / file): Asset(name) for name, file in SHIPPED.items() if (ASSETS / file).is_file()}
-        self.assets = shipped | {_read_digest(file): Asset(file) for file in files}  # what fields call the content of a digest
+        self.assets = shipped | {_read_digest(file): Asset(file) for file in files}  # digest -> value of a field
 
     def photographs(self, record: Record) -> Images:
-        """The photographs of a record.
+        """Return the photographs of a record.
 
         Raises
         ------
         UserError
-            if they are not here.
+            if this machine lacks them.
         """
         if record["dataset"]["spec"] is not None or record["dataset"]["name"] == BUILTIN:
             return None
@@ -188,7 +188,7 @@ class _LocalInputs:
         return self.images
 
     def plugin(self, kind: Kind[P], configuration: Mapping[str, Any]) -> P:
-        """The plugin of a configuration. Files that are not here are taken to be its default ones.
+        """Return the plugin of a configuration. Files that this machine lacks are replaced by the default ones.
 
         Raises
         ------
@@ -208,112 +208,118 @@ class _LocalInputs:
                 try:
                     given[name] = fields.parse_value(types[name], text)
                 except ValueError:
-                    raise UserError(f"{plugin.name()}: {name} must be {fields.describe_type(types[name])}, not {text!r}") from None
+                    raise UserError(
+                        f"{plugin.name()}: {name} must be {fields.describe_type(types[name])}, not {text!r}"
+                    ) from None
         return spec.build(plugin, given)
 
 
-Planned = tuple[int, Experiment, list[NumberedRecord], Plan]
+Planned = tuple[Experiment, list[NumberedRecord], Plan]
 
 
-def _rebuild_plans(format_faults: Sequence[NumberedRecord], here: _LocalInputs) -> Iterator[list[Planned | Fault]]:
-    """Each cell with its lines, and the plan that it is of; or why there is none."""
+def _rebuild_plans(lines: Sequence[NumberedRecord], inputs: _LocalInputs) -> Iterator[Planned | Fault]:
+    """Yield each experiment with its lines and its plan, or why there is none."""
     groups: dict[str, list[NumberedRecord]] = {}
-    for line in format_faults:
+    for line in lines:
         groups.setdefault(line.record["experiment_id"], []).append(line)
     for members in groups.values():
         first = members[0]
         try:
-            plan = build_plan(_build_configuration(first.record, here))
-            yield [(first.number, plan.experiments[0], members, plan)]
+            plan = build_plan(_build_configuration(first.record, inputs))
+            yield plan.experiments[0], members, plan
         except (UserError, SampleError) as error:
-            yield [Fault(first.number, " ".join(str(error).split()))]
+            yield Fault(first.number, " ".join(str(error).split()))
 
 
-def _build_configuration(record: Record, here: _LocalInputs) -> RunConfiguration:
-    task: Task = here.plugin(discovery.TASK, {"name": record["task"], **record["task_settings"]})
+def _build_configuration(record: Record, inputs: _LocalInputs) -> RunConfiguration:
+    task: Task = inputs.plugin(discovery.TASK, {"name": record["task"], **record["task_settings"]})
     dataset = record["dataset"]["spec"]
-    defense = here.plugin(discovery.DEFENSE, record["defense"])
-    quantised = defense.dictionary_field
-    if dataset is not None and quantised is not None and record["defense"][quantised] not in here.assets:
-        defense = dataclasses.replace(defense, **{quantised: Asset(REFERENCES)})  # type: ignore[type-var]
+    defense = inputs.plugin(discovery.DEFENSE, record["defense"])
+    field = defense.dictionary_field
+    if dataset is not None and field is not None and record["defense"][field] not in inputs.assets:
+        defense = dataclasses.replace(defense, **{field: Asset(REFERENCES)})  # type: ignore[type-var]
     return RunConfiguration(
-        pairs=((defense, None if record["attack"] is None else here.plugin(discovery.ATTACK, record["attack"])),),
-        images=here.photographs(record),
+        pairs=((defense, None if record["attack"] is None else inputs.plugin(discovery.ATTACK, record["attack"])),),
+        images=inputs.photographs(record),
         task=task,
-        extractor=here.plugin(discovery.EXTRACTOR, record["dataset"]["extractor"]),
-        dataset=None if dataset is None else here.plugin(discovery.DATASET, dataset),
+        extractor=inputs.plugin(discovery.EXTRACTOR, record["dataset"]["extractor"]),
+        dataset=None if dataset is None else inputs.plugin(discovery.DATASET, dataset),
         seed=record["seed"],
     )
 
 
-def _check_experiment(cell: Experiment, members: Sequence[NumberedRecord], plan: Plan) -> Iterator[Fault]:
-    """What cannot be so in a cell: other inputs than those here, a pair that does not apply, other promises, units left out."""
+def _check_experiment(experiment: Experiment, members: Sequence[NumberedRecord], plan: Plan) -> Iterator[Fault]:
+    """Yield contradictions in an experiment: other inputs, a pair that does not apply, another guarantee, missing samples."""
     first = members[0]
-    if cell.metadata["experiment_id"] != first.record["experiment_id"]:
-        yield Fault(first.number, f"another cell than can be made here: {_find_difference(first.record, cell.metadata)}")
+    if experiment.metadata["experiment_id"] != first.record["experiment_id"]:
+        yield Fault(
+            first.number, f"not the experiment that this machine plans: {_find_difference(first.record, experiment.metadata)}"
+        )
         return
-    names = {unit.name for unit in plan.samples}
+    names = {sample.name for sample in plan.samples}
     for line in members:
         record = line.record
-        if (cell.reason is None) == (record["status"] == "n/a"):
-            told = f"does not apply ({cell.reason})" if cell.reason else "applies, but the record says n/a"
-            yield Fault(line.number, f"status: the pair {told}")
-        if record["sample"] not in (names if cell.reason is None else {EVERY_SAMPLE}):
+        if (experiment.reason is None) == (record["status"] == "n/a"):
+            message = f"does not apply ({experiment.reason})" if experiment.reason else "applies, but the record says n/a"
+            yield Fault(line.number, f"status: the pair {message}")
+        if record["sample"] not in (names if experiment.reason is None else {EVERY_SAMPLE}):
             yield Fault(line.number, f"sample: the dataset has no {record['sample']!r}")
-        right = build_privacy(cell, record["privacy"]["keypoints"])
-        for name, value in right.items():
-            told = record["privacy"].get(name)
-            if not _is_close(told, value):
-                yield Fault(line.number, f"privacy.{name}: is {_shorten(told)}, should be {_shorten(value)}")
-    missing = sorted(names - {line.record["sample"] for line in members}) if cell.reason is None else []
+        expected = build_privacy(experiment, record["privacy"]["keypoints"])
+        for name, value in expected.items():
+            actual = record["privacy"].get(name)
+            if not _is_close(actual, value):
+                yield Fault(line.number, f"privacy.{name}: is {_shorten(actual)}, should be {_shorten(value)}")
+    missing = sorted(names - {line.record["sample"] for line in members}) if experiment.reason is None else []
     if missing:
-        yield Fault(first.number, f"its cell lacks {len(missing)} of {len(names)} units, such as {missing[0]!r}")
+        yield Fault(first.number, f"its experiment lacks {len(missing)} of {len(names)} samples, such as {missing[0]!r}")
 
 
-def _find_difference(record: Record, here: Record) -> str:
-    """The first part of the configuration that is another here."""
+def _find_difference(record: Record, local: Record) -> str:
+    """Return the first part of the configuration that differs on this machine."""
     for part in ("defense", "attack", "dataset", "metric_settings", "task_settings"):
-        theirs, ours = record[part] or {}, here[part] or {}
+        theirs, ours = record[part] or {}, local[part] or {}
         for name in (*theirs, *ours):
             if theirs.get(name) != ours.get(name) and (part != "dataset" or name not in ("name", "spec")):
-                return f"{part}.{name} is {_shorten(theirs.get(name))}, here {_shorten(ours.get(name))} (give its file by --file?)"
+                values = f"{_shorten(theirs.get(name))}, here {_shorten(ours.get(name))}"
+                return f"{part}.{name} is {values} (give its file by --file?)"
     return "its configuration is the same"
 
 
-# ---- a sample, made again
+# ---- a sample, computed again
 
 
-def _repeat_sample(done: Sequence[tuple[Plan, Experiment, NumberedRecord]], sample: int, seed: int) -> Iterator[Fault]:
-    """What of the sample comes out differently where the attack's process does not hold the secret."""
-    usable = [one for one in done if one[1].metadata["experiment_id"] == one[2].record["experiment_id"]]
-    chosen = np.sort(np.random.default_rng(seed).permutation(len(usable))[:sample])
-    with Progress("made again", len(chosen)) as progress:
-        for plan, cell, line in (usable[place] for place in chosen):
-            yield from _compare(line, _repeat(plan, cell, line.record["sample"]))
+def _repeat_sample(completed: Sequence[tuple[Plan, Experiment, NumberedRecord]], sample: int, seed: int) -> Iterator[Fault]:
+    """Compute a sample of the records again, in a process without the secret, and yield what differs."""
+    usable = [one for one in completed if one[1].metadata["experiment_id"] == one[2].record["experiment_id"]]
+    selection = np.sort(np.random.default_rng(seed).permutation(len(usable))[:sample])
+    with Progress("computed again", len(selection)) as progress:
+        for plan, experiment, line in (usable[index] for index in selection):
+            yield from _compare(line, _repeat(plan, experiment, line.record["sample"]))
             progress.advance(note=line.record["sample"])
 
 
-def _repeat(plan: Plan, cell: Experiment, name: str) -> Record | None:
-    unit = next((unit for unit in plan.samples if unit.name == name), None)
-    apart = dataclasses.replace(plan, execute=execute_in_attack_process)
-    return None if unit is None or cell.reason else TrialRunner(apart).execute(cell, unit).record
+def _repeat(plan: Plan, experiment: Experiment, name: str) -> Record | None:
+    sample = next((sample for sample in plan.samples if sample.name == name), None)
+    separate = dataclasses.replace(plan, execute=execute_in_attack_process)
+    return None if sample is None or experiment.reason else TrialRunner(separate).execute(experiment, sample).record
 
 
-def _compare(line: NumberedRecord, again: Record | None) -> Iterator[Fault]:
-    if again is None:
-        return  # that it cannot be is told already
-    if again["status"] != "ok":
-        yield Fault(line.number, f"made again, it failed: {_shorten(again['reason'])}")
+def _compare(line: NumberedRecord, repeated: Record | None) -> Iterator[Fault]:
+    if repeated is None:
+        return  # reported already
+    if repeated["status"] != "ok":
+        yield Fault(line.number, f"computed again, it failed: {_shorten(repeated['reason'])}")
         return
-    told = line.record["metrics"]
-    for name in sorted({*told, *again["metrics"]}):
-        theirs, ours = told.get(name), again["metrics"].get(name)
+    submitted, metrics = line.record["metrics"], repeated["metrics"]
+    for name in sorted({*submitted, *metrics}):
+        theirs, ours = submitted.get(name), metrics.get(name)
         if theirs is None or ours is None:
-            right = theirs is ours
+            equal = theirs is ours
         else:
-            right = abs(theirs - ours) <= ABSOLUTE_TOLERANCE + RELATIVE_TOLERANCE * abs(ours)
-        if not right:
-            yield Fault(line.number, f"metrics.{name}: is {_format_number(theirs)}, and {_format_number(ours)} when it is made again")
+            equal = abs(theirs - ours) <= ABSOLUTE_TOLERANCE + RELATIVE_TOLERANCE * abs(ours)
+        if not equal:
+            values = f"is {_format_number(theirs)}, and {_format_number(ours)} when it is computed again"
+            yield Fault(line.number, f"metrics.{name}: {values}")
 
 
 def _is_close(one: Any, other: Any) -> bool:
@@ -326,19 +332,19 @@ def _format_number(value: float | None) -> str:
 
 
 def _shorten(value: Any) -> str:
-    """Of one line, and not too long, whatever somebody wrote."""
+    """Return one short line of printable characters."""
     text = " ".join(str(value).split())
     text = "".join(letter if letter.isprintable() else "?" for letter in text)
     return text if len(text) <= MAX_LENGTH else text[: MAX_LENGTH - 3] + "..."
 
 
 def _read_digest(path: Path) -> str:
-    """What records know a file by, from its header.
+    """Return the digest of a file in records, from its header.
 
     Raises
     ------
     UserError
-        if it is no safetensors file of this program's.
+        if it is no safetensors file of this program.
     """
     from safetensors import SafetensorError, safe_open
 
@@ -346,9 +352,9 @@ def _read_digest(path: Path) -> str:
         with safe_open(path, framework="numpy") as opened:
             return str((opened.metadata() or {})["digest"])
     except (OSError, SafetensorError, KeyError) as error:
-        raise UserError(f"--file {path}: no dictionary and no network of this program's ({error})") from None
+        raise UserError(f"--file {path}: no dictionary or network of this program ({error})") from None
 
 
 def format_faults(faults: Iterable[Fault]) -> Iterator[str]:
-    """One line each."""
+    """Yield a line for each fault."""
     return (f"line {fault.line}: {fault.message}" for fault in faults)

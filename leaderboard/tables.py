@@ -40,7 +40,7 @@ def build_tables(records: Iterable[Record], *, brief: bool = False, foldable: bo
     A row has the mean of each metric over the photographs that have it, or the median over all for `MEDIAN_METRICS`, and Wilson's
     interval for fractions. What does not apply is missing, and its note says why.
 
-    `brief` tables are for a terminal: without `FILE_ONLY_COLUMNS` and with numbered notes. In `foldable` ones labels may be broken
+    `brief` tables are for a terminal: without `FILE_ONLY_COLUMNS`, with numbered notes. In `foldable` ones labels may be broken
     between fields, and can no longer be copied into a command.
     """
     groups = _group_by(
@@ -59,7 +59,7 @@ _NOUNS: Mapping[str, str] = {"localization": "query", "structure": "scene", "mat
 
 
 def build_labels(pairs: Sequence[tuple[Configuration, Configuration]]) -> list[tuple[str, str]]:
-    """Return short names of defenses and attacks, `ldp:epsilon=10,subset_size=2`; with digests only where names would be equal."""
+    """Return short names of defenses and attacks, `ldp:epsilon=10,subset_size=2`; with digests only to tell equal ones apart."""
     short = [(_label(defense), _label(attack)) for defense, attack in pairs]
     contents: dict[tuple[str, str], set[str]] = {}
     for names, pair in zip(short, pairs, strict=True):
@@ -187,9 +187,7 @@ def _list_notes(records: list[Record], completed: list[Record]) -> list[str]:
     shared = [note for note in completed[0]["notes"] if all(note in record["notes"] for record in completed)]
     beyond = [f"not covered either: {', '.join(uncovered)}"] if uncovered else []
     by_distance = records[0]["privacy"].get("epsilon_per_distance")
-    other = (
-        [] if by_distance is None else [f"another promise than ε-LDP: ε = {format_number(by_distance)} per unit of distance"]
-    )
+    other = [] if by_distance is None else [f"another promise than ε-LDP: ε = {format_number(by_distance)} per unit of distance"]
     return [*other, *shared, *beyond]
 
 
@@ -282,6 +280,4 @@ def format_number(value: float) -> str:
 
 def format_chance(log10: float) -> str:
     """Return a probability from its decimal logarithm, which may be far below what a float can hold."""
-    if math.isnan(log10):
-        return NOT_APPLICABLE
     return f"{10**log10:.4g}" if log10 > -5 else f"10^{log10:.1f}"

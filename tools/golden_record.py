@@ -1,35 +1,38 @@
 """Records what every defense releases and what every attack and task scores on it, at smoke size.
 
-    python tools/golden_record.py write golden.jsonl     # on the code before a change
-    python tools/golden_record.py check golden.jsonl     # on the code after it, on the same machine
+    python tools/golden_record.py write tests/data/golden.jsonl     # on the code before a change
+    python tools/golden_record.py check tests/data/golden.jsonl     # on the code after it, on the same machine
 
 A release must be the same to the last bit, and a score within 1e-6. Digests of our own source, which enter the keys of rendered
-images and of a scene's dictionary, are held constant, so that a change of names is no change of content.
+images and of a scene's dictionary, are held constant, so that a change of names is no change of content. Other processors and
+libraries round differently: the first line holds both, and `check` says so where they differ.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 import hashlib
 import json
 import math
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 
 from bench.cache import provenance, store
+from bench.core import environment
 from bench.core.errors import SampleError
 from bench.datasets import gallery
 from bench.images import photographs
 from bench.registry import discovery, spec
-from bench.runner.plan import RunConfiguration
+from bench.runner.plan import Plan, RunConfiguration, build_plan
 from bench.runner.trial import TrialRunner
-from bench.task_api import Task
 from bench.types import Release
 
 TOLERANCE = 1e-6
@@ -85,36 +88,35 @@ def cases() -> Iterator[Case]:
     yield Case("structure", ("none", "affine", "ldp:words=8000,epsilon=16"), extractor=FEW, dataset=WALK)
 
 
-def write(file: Any) -> None:
-    for case in cases():
-        for line in measured(case):
-            file.write(json.dumps(line) + "\n")
-            file.flush()
+def measure_all(selected: Sequence[Case]) -> Iterator[dict[str, Any]]:
+    """Yield the lines of these cases."""
+    for case in selected:
+        yield from measure(case)
 
 
-def measured(case: Case) -> Iterator[dict[str, Any]]:
-    """One line for each pair on each sample."""
-    plan = planned(case)
-    trials = TrialRunner(plan)
-    for unit in plan.samples[: case.samples]:
-        for cell in plan.experiments:
+def measure(case: Case) -> Iterator[dict[str, Any]]:
+    """Yield one line for each pair on each sample."""
+    plan = plan_case(case)
+    runner = TrialRunner(plan)
+    for sample in plan.samples[: case.samples]:
+        for experiment in plan.experiments:
             line: dict[str, Any] = {
                 "case": [case.task, case.extractor, case.dataset],
-                "defense": spec.to_json(cell.defense),
-                "attack": cell.attack and spec.to_json(cell.attack),
-                "sample": unit.name,
+                "defense": spec.to_json(experiment.defense),
+                "attack": experiment.attack and spec.to_json(experiment.attack),
+                "sample": sample.name,
             }
-            if cell.reason is not None:
+            if experiment.reason is not None:
                 yield line | {"applies": False}
                 continue
             try:
-                trial = trials.build_trial(cell, unit)
+                trial = runner.build_trial(experiment, sample)
                 outcome = plan.task.evaluate(trial)
             except SampleError as error:
                 yield line | {"applies": True, "failed": type(error).__name__}
                 continue
-            others = list(trial.others(2)) if cell.attack is not None else []
-            releases = [*(shot.release for shot in trial.images), *trial.repeats, *others]
+            others = list(trial.others(2)) if experiment.attack is not None else []
+            releases = [*(image.release for image in trial.images), *trial.repeats, *others]
             image = None if outcome.image is None else [float(outcome.image.mean()), float(outcome.image.std())]
             yield line | {
                 "applies": True,
@@ -124,16 +126,17 @@ def measured(case: Case) -> Iterator[dict[str, Any]]:
             }
 
 
-def planned(case: Case) -> Any:
-    sources = [source for source in photographs.list_builtin() if case.photographs is not None and source.name in case.photographs]
-    task: Task = spec.read(case.task, discovery.TASK)
+def plan_case(case: Case) -> Plan:
+    sources = [
+        source for source in photographs.list_builtin() if case.photographs is not None and source.name in case.photographs
+    ]
     attacks = [None if text is None else spec.read(text, discovery.ATTACK) for text in case.attacks]
     pairs = [(spec.read(text, discovery.DEFENSE), attack) for text in case.defenses for attack in attacks]
     return build_plan(
         RunConfiguration(
             pairs=tuple(pairs),
             images=sources or None,
-            task=task,
+            task=spec.read(case.task, discovery.TASK),
             extractor=spec.read(case.extractor, discovery.EXTRACTOR),
             dataset=None if case.dataset is None else spec.read(case.dataset, discovery.DATASET),
             seed=5,
@@ -142,12 +145,12 @@ def planned(case: Case) -> Any:
 
 
 def arrays(release: Release) -> dict[str, np.ndarray]:
-    """All that is released, by names that do not depend on how the class is written."""
-    found = {"keypoints": release.keypoints, "size": np.array(release.size, np.int64)}
+    """Return all arrays of a release, by names that do not depend on its class."""
+    content = {"keypoints": release.keypoints, "size": np.array(release.size, np.int64)}
     for name in ("descriptors", "frames", "origins", "bases", "candidates", "words"):
         if (value := getattr(release, name, None)) is not None:
-            found[name] = value
-    return found
+            content[name] = value
+    return content
 
 
 def digest(release: Release) -> str:
@@ -158,17 +161,18 @@ def digest(release: Release) -> str:
     return hashed.hexdigest()
 
 
-def differences(before: list[dict[str, Any]], after: list[dict[str, Any]]) -> Iterator[str]:
-    if len(before) != len(after):
-        yield f"{len(before)} lines before, {len(after)} after"
-    for old, new in zip(before, after, strict=False):
-        label = f"{old['case'][0]} {old['defense']['name']} {old['attack'] and old['attack']['name']} {old['sample']}"
-        for name in old.keys() | new.keys():
-            if name in ("metrics", "image"):
-                if not close(old.get(name), new.get(name)):
-                    yield f"{label}: {name} {old.get(name)} -> {new.get(name)}"
-            elif old.get(name) != new.get(name):
-                yield f"{label}: {name} {old.get(name)} -> {new.get(name)}"
+def find_differences(before: Sequence[dict[str, Any]], after: Iterable[dict[str, Any]]) -> Iterator[str]:
+    """Yield a message for each difference of a line after the change to the line before it with the same label."""
+    known = {label(line): line for line in before}
+    for new in after:
+        old = known.get(label(new), {})
+        for name in sorted(old.keys() | new.keys()):
+            if not close(old.get(name), new.get(name)):
+                yield f"{label(new)}: {name} was {old.get(name)}, is {new.get(name)}"
+
+
+def label(line: dict[str, Any]) -> str:
+    return json.dumps([line[name] for name in ("case", "defense", "attack", "sample")], sort_keys=True)
 
 
 def close(old: Any, new: Any) -> bool:
@@ -181,25 +185,52 @@ def close(old: Any, new: Any) -> bool:
     return bool(old == new)
 
 
+@contextlib.contextmanager
+def constant_sources() -> Iterator[None]:
+    """Hold the digests of our own source constant, and use an empty cache."""
+    with (
+        mock.patch.object(provenance, "hash_modules", lambda *modules: "sha256:constant"),
+        mock.patch.object(gallery, "_hash_renderer", lambda: "constant"),
+        tempfile.TemporaryDirectory() as folder,
+        store.use_folder(Path(folder)),
+    ):
+        yield
+
+
+def describe_machine() -> dict[str, Any]:
+    """Return what numbers may depend on beside our own source."""
+    return environment.describe_platform() | {"threads": 0}
+
+
+def read(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Return the machine and the lines of a golden record."""
+    machine, *lines = (json.loads(line) for line in path.read_text(encoding="utf-8").splitlines())
+    return machine, lines
+
+
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", choices=("write", "check"))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("action", choices=("write", "check"))
     parser.add_argument("file", type=Path)
+    parser.add_argument("--case", type=int, action="append", help="number of a case, from 0; may be given several times")
     options = parser.parse_args()
-    provenance.hash_modules = lambda *modules: "sha256:constant"
-    gallery._hash_renderer = lambda: "constant"
-    with tempfile.TemporaryDirectory() as folder, store.use_folder(Path(folder)):
-        if options.what == "write":
-            with options.file.open("w") as file:
-                write(file)
+    every = list(cases())
+    selected = [every[number] for number in options.case] if options.case else every
+    with constant_sources():
+        if options.action == "write":
+            with options.file.open("w", encoding="utf-8") as file:
+                for line in (describe_machine(), *measure_all(selected)):
+                    file.write(json.dumps(line) + "\n")
             return 0
-        with tempfile.TemporaryFile("w+") as file:
-            write(file)
-            file.seek(0)
-            after = [json.loads(line) for line in file]
-    found = list(differences([json.loads(line) for line in options.file.open()], after))
-    print("\n".join(found) or f"{len(after)} lines: the same")
-    return 1 if found else 0
+        machine, before = read(options.file)
+        if machine != describe_machine():
+            print(f"written on another machine: {machine}")
+        count = 0
+        for message in find_differences(before, measure_all(selected)):
+            print(message, flush=True)
+            count += 1
+    print(f"{count} differences")
+    return 1 if count else 0
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""Rebuilds what `bench/assets` ships from a folder with `train/`, `tune.txt` and `test.txt`. Takes hours, resumes.
+"""Rebuilds the files of `bench/assets` from a folder with `train/`, `tune.txt` and `test.txt`. Takes hours; can be resumed.
 
-The photographs of `train/` that are in neither list are parted by name into three thirds. The dictionary is made from the first
+The photographs of `train/` that are in neither list are split by name into three thirds. The dictionary is built from the first
 two thirds, the attacker's public database from the last. All networks start from one that was trained on raw descriptors of all
-photographs. They are then trained equally long for their own releases, on the last third, which the dictionary does not know.
-Two networks start from nothing: of positions alone, and of raw oriented descriptors.
+photographs. They are then trained equally long for their own releases, on the last third, which is not part of the dictionary.
+Two networks start from random weights: for positions alone, and for raw oriented descriptors.
 """
 
 from __future__ import annotations
@@ -22,31 +22,31 @@ DEFENSES = ("none", "affine", "ldp")
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--work", type=Path, required=True, help="kept between runs; what is done is not done again")
-    parser.add_argument("--steps", type=int, default=17_800, help="of the common start, each of 8 crops")
-    parser.add_argument("--own-steps", type=int, default=4500, help="of each network from there, and of that for positions")
+    parser.add_argument("--work", type=Path, required=True, help="folder of finished files, reused between runs")
+    parser.add_argument("--steps", type=int, default=17_800, help="of the common first stage, each of 8 training samples")
+    parser.add_argument("--own-steps", type=int, default=4500, help="of each second stage, and of the network for positions")
     parser.add_argument("--oriented-steps", type=int, default=20_800, help="of the network for oriented descriptors")
     args = parser.parse_args()
-    folders = part(args.data, args.work / "photographs")
+    folders = split_photographs(args.data, args.work / "photographs")
     for file, photographs, words in (("dictionary", "01", WORDS), ("public-database", "2", PUBLIC_WORDS)):
         build = "dictionary", "build", "--images", folders[photographs], "--size", words
-        ship(made(args.work / f"{file}.safetensors", *build))
+        ship(run_once(args.work / f"{file}.safetensors", *build))
     unseen = ["--validation", folders["tune"]]
     given = ["--images", folders["012"], *unseen]
-    start = made(args.work / "start.safetensors", "train", "--defense", "none", *given, "--steps", args.steps)
+    initial = run_once(args.work / "start.safetensors", "train", "--defense", "none", *given, "--steps", args.steps)
     for name in DEFENSES:
-        own = ["--images", folders["2"], *unseen, "--start", start, "--steps", args.own_steps, "--rate", 2e-3]
-        ship(made(args.work / f"inversion-{name}.safetensors", "train", "--defense", name, *own))
+        own = ["--images", folders["2"], *unseen, "--initial-checkpoint", initial, "--steps", args.own_steps, "--rate", 2e-3]
+        ship(run_once(args.work / f"inversion-{name}.safetensors", "train", "--defense", name, *own))
     alone = {
         "positions": ["--encoding", "positions", "--steps", args.own_steps],
         "inversion-oriented": ["--extractor", "sift:upright=false", "--steps", args.oriented_steps],
     }
     for name, options in alone.items():
-        ship(made(args.work / f"{name}.safetensors", "train", "--defense", "none", *given, *options))
+        ship(run_once(args.work / f"{name}.safetensors", "train", "--defense", "none", *given, *options))
 
 
-def part(data: Path, work: Path) -> dict[str, Path]:
-    """Folders of links to the photographs of each set: unions of thirds named by their digits, and `tune`."""
+def split_photographs(data: Path, work: Path) -> dict[str, Path]:
+    """Create folders of links to the photographs of each set: unions of thirds named by their digits, and `tune`."""
     tune, test = (set((data / f"{name}.txt").read_text().split()) for name in ("tune", "test"))
     names = sorted(path.name for path in (data / "train").iterdir() if path.name not in tune | test)
     sets = {digits: [name for number, name in enumerate(names) if str(number % 3) in digits] for digits in ("01", "2", "012")}
@@ -61,14 +61,14 @@ def part(data: Path, work: Path) -> dict[str, Path]:
     return folders
 
 
-def made(out: Path, *words: object) -> Path:
-    """What a command of `bench` writes to `out`, unless it is there."""
+def run_once(out: Path, *words: object) -> Path:
+    """Run a command of `bench` that writes `out`, unless that exists."""
     if not out.is_file():
-        run(*words, "--out", out)
+        run_command(*words, "--out", out)
     return out
 
 
-def run(*words: object) -> None:
+def run_command(*words: object) -> None:
     command = [str(word) for word in words]
     print("bench", *command, flush=True)
     if bench(command) != 0:

@@ -1,7 +1,7 @@
-"""Trains the network of the attack `context` and writes `bench/assets/context.safetensors`. About 20 minutes on one idle core.
+"""Trains the context model and writes `bench/assets/context.safetensors`. About 20 minutes on one idle core.
 
-It learns from the third of the photographs of `train/` that the shipped dictionary was not made from (`make_assets.part`): a
-photograph that helped to make a dictionary quantises to nearly itself.
+The training photographs are the third of `train/` that the shipped dictionary was not built from
+(`make_assets.split_photographs`), since photographs of a dictionary quantise to nearly themselves.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from make_assets import part
+from make_assets import split_photographs
 
 from bench.codebook.public import ASSETS, Public
 from bench.context.network import Shape
@@ -24,8 +24,8 @@ from bench.inversion.train import check_quantisation
 from bench.inversion.weights import describe
 from defenses.ldp import LDP
 
-SERVED = {field: LDP.supported_settings[field] for field in ("epsilon", "subset_size")}
-TRIED = [LDP(epsilon=epsilon, subset_size=size) for epsilon, size in ((8, 2), (10, 1), (10, 2), (10, 4), (12, 2), (16, 2))]
+SUPPORTED = {field: LDP.supported_settings[field] for field in ("epsilon", "subset_size")}
+VALIDATED = [LDP(epsilon=epsilon, subset_size=size) for epsilon, size in ((8, 2), (10, 1), (10, 2), (10, 4), (12, 2), (16, 2))]
 
 
 def main() -> None:
@@ -33,27 +33,29 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--work", type=Path, required=True)
     parser.add_argument("--out", type=Path, default=ASSETS / "context.safetensors")
-    parser.add_argument("--steps", type=int, default=2000, help="of two crops each")
+    parser.add_argument("--steps", type=int, default=2000, help="of two training samples each")
     args = parser.parse_args()
-    folders = part(args.data, args.work / "photographs")
-    views, unseen = (collect_views(list_photographs(folders[name]), Sift())[::2] for name in ("2", "tune"))  # not the mirrored ones
+    folders = split_photographs(args.data, args.work / "photographs")
+    views, unseen = (
+        collect_views(list_photographs(folders[name]), Sift())[::2] for name in ("2", "tune")
+    )  # without mirrored ones
     train(views, [view for view in unseen if len(view.pixels) == SIDE], args.out, Training(steps=args.steps, batch=2))
 
 
 def train(views: list[PhotographView], unseen: list[PhotographView], out: Path, training: Training) -> None:
     defense, shape, public = LDP(), Shape(), Public()
-    every = [*views, *unseen]
-    dictionaries = assign_dictionaries({view.photograph for view in every}, [defense.dictionary], public)
-    public = Public(quantise(every, dictionaries, [0], public))
+    all_views = [*views, *unseen]
+    dictionaries = assign_dictionaries({view.photograph for view in all_views}, [defense.dictionary], public)
+    public = Public(quantise(all_views, dictionaries, [0], public))
     errors = {
         "training": measure_quantisation_error(views, dictionaries, public),
         "validation": measure_quantisation_error(unseen, dictionaries, public),
     }
     check_quantisation(**errors)
-    draw = build_sampler(views, defense, SERVED, "subset_size", public, shape.neighbours, training.batch)
+    draw = build_sampler(views, defense, SUPPORTED, "subset_size", public, shape.neighbours, training.batch)
     module, secrets = fit(shape, draw, training), [view.features for view in unseen]
     meta = {
-        **describe(defense, dict(SERVED), Sift(), Public()),
+        **describe(defense, dict(SUPPORTED), Sift(), Public()),
         "photographs": sorted({view.photograph for view in views}),
         "crops": training.steps * training.batch,
         "batch": training.batch,
@@ -62,7 +64,7 @@ def train(views: list[PhotographView], unseen: list[PhotographView], out: Path, 
         "quantisation_error": errors,
         "validation": [
             {"epsilon": tried.epsilon, "subset_size": tried.subset_size, **validate(module, secrets, tried, public)}
-            for tried in TRIED
+            for tried in VALIDATED
         ],
     }
     save(out, module, meta)

@@ -1,10 +1,11 @@
-"""Tries ideas for the inversion network in short trainings of equal processor time, and ranks them on `tune.txt`.
+"""Compares ideas for the inversion network in short trainings of equal processor time, and ranks them on `tune.txt`.
 
-    python tools/training_ideas.py --data ../shared/data --work work/ideas [--idea NAME ...] [--seconds 600] [--start FILE]
+    python tools/training_ideas.py --data ../shared/data --work work/ideas [--idea NAME ...] [--seconds 600]
+        [--initial-checkpoint FILE]
 
-Each idea differs from what `bench train` does in what IDEAS says of it. All train on raw descriptors of the photographs of
-`train/` that are in neither list, from random weights or from a trained network's, and are scored on the 100 of `tune.txt`. What
-came out is kept in docs/ideas.jsonl, a line a training, and the page docs/ideas.md is written from it.
+IDEAS lists how each idea differs from `bench train`. All train on raw descriptors of the photographs of `train/` that are in
+neither list, from random weights or from a trained network, and are scored on the 100 of `tune.txt`. Results are appended to
+docs/ideas.jsonl, one line per training, from which the page docs/ideas.md is written.
 """
 
 from __future__ import annotations
@@ -24,13 +25,14 @@ import cv2
 import numpy as np
 import torch
 import torch.nn.functional as nnf
-from make_assets import part
-from perceptual_loss import classifiers, unlike, vgg_file, vggs
+from make_assets import split_photographs
+from perceptual_loss import extract_classifier, extract_vgg, measure_dissimilarity, vgg_file
 from torch import Tensor, nn
 
 from bench.codebook.public import Public
 from bench.core.errors import UserError
 from bench.core.progress import Progress
+from bench.core.table import markdown_row
 from bench.extractors.sift import Sift
 from bench.images.photographs import list_photographs
 from bench.images.views import PhotographView, collect_views
@@ -46,23 +48,22 @@ from bench.inversion.symmetry import IDENTITY, Symmetry, find_symmetries
 from bench.inversion.train import build_batch, score, validate
 from bench.types import Descriptors, Points
 from defenses.none import Undefended
-from bench.core.table import markdown_row
 
 DOCS = Path(__file__).parents[1] / "docs"
 LOG, PAGE = DOCS / "ideas.jsonl", DOCS / "ideas.md"
 SIZES = ("crops", "parameters", "photographs", "date")
-WARMUP = 50  # steps; fewer than `bench train` takes, for these trainings are short
+WARMUP = 50  # steps; fewer than in `bench train`, since these trainings are short
 UNCHANGED = "as bench train"
-PAPER = {"ssim": (0.6878, 3), "psnr": (18.59, 2)}  # its row of raw descriptors, and digits
+PAPER = {"ssim": (0.6878, 3), "psnr": (18.59, 2)}  # the row of raw descriptors, and digits
 VGG = "loss: what VGG sees"
 UNTURNED = "not turned"  # but mirrored, as half of the views are
-INPUTS = 128 + 2  # a raw descriptor, and the place within a cell
+INPUTS = 128 + 2  # a raw descriptor, and the position within a cell
 
 
 # ---- losses
 
 
-def loss(
+def compute_loss(
     reconstruction: Tensor,
     photograph: Tensor,
     dissimilarity: float = WEIGHT,
@@ -74,8 +75,11 @@ def loss(
     classifier: float = 0.0,
     vgg: float = 0.0,
 ) -> Tensor:
-    """A weighted sum: 1 - SSIM of luminance, L1, root and logarithm of each image's square error, L1 of four coarser scales, of
-    differences between neighbouring pixels, and of what a classifier sees, or VGG. By default it is `bench train`'s."""
+    """Return a weighted sum of losses: 1 - SSIM of luminance, L1, root and logarithm of each image's square error, L1 of four
+    coarser scales, of differences between neighbouring pixels, and of features of a classifier or VGG.
+
+    The default is the loss of `bench train`.
+    """
     luma = torch.tensor(LUMA, device=reconstruction.device).view(1, 3, 1, 1)
     total = dissimilarity * (1 - ssim((reconstruction * luma).sum(dim=1), (photograph * luma).sum(dim=1)))
     total = total + l1 * (reconstruction - photograph).abs().mean()
@@ -89,9 +93,9 @@ def loss(
         for _ in range(4):
             reconstruction, photograph = nnf.avg_pool2d(reconstruction, 2), nnf.avg_pool2d(photograph, 2)
             total = total + coarse * (reconstruction - photograph).abs().mean()
-    for weight, eye in ((classifier, classifiers), (vgg, vggs)):
+    for weight, extract in ((classifier, extract_classifier), (vgg, extract_vgg)):
         if weight:
-            total = total + weight * unlike(reconstruction, photograph, eye)
+            total = total + weight * measure_dissimilarity(reconstruction, photograph, extract)
     return total
 
 
@@ -99,7 +103,7 @@ def loss(
 
 
 class Attentive(Inverter):
-    """Before anything is scattered, keypoints look at those nearest to them."""
+    """Keypoints attend to their nearest neighbours before they are scattered."""
 
     def __init__(self, shape: Shape, blocks: int) -> None:
         super().__init__(shape)
@@ -107,14 +111,14 @@ class Attentive(Inverter):
 
     def embed_points(self, points: EncodedRelease) -> Tensor:
         hidden = super().embed_points(points)
-        near, apart = nearest(points.image, points.places * CELL, Neighbours.count)
+        near, apart = find_nearest(points.image, points.coordinates * CELL, Neighbours.count)
         for block in self.blocks:
             hidden = block(hidden, near, apart)
         return hidden
 
 
 class Neighbours(nn.Module):
-    """Attention of each keypoint to those nearest to it, by what they are and where they lie; then a layer of its own."""
+    """Attention of each keypoint to its nearest neighbours, by embedding and relative position; then an MLP."""
 
     count = 12
     heads, width = 4, 24
@@ -123,20 +127,20 @@ class Neighbours(nn.Module):
         super().__init__()
         inner = self.heads * self.width
         self.norm = nn.LayerNorm(hidden)
-        self.query, self.seen = nn.Linear(hidden, inner), nn.Linear(hidden, 2 * inner)
+        self.query, self.key_value = nn.Linear(hidden, inner), nn.Linear(hidden, 2 * inner)
         self.where = nn.Sequential(nn.Linear(6, 32), nn.SiLU(), nn.Linear(32, self.heads + inner))
         self.out = nn.Linear(inner, hidden)
         last = nn.Linear(hidden, hidden)
         self.own = nn.Sequential(nn.LayerNorm(hidden), nn.Linear(hidden, hidden), nn.SiLU(), last)
-        nn.init.zeros_(self.out.weight)  # a block begins as one that changes nothing
+        nn.init.zeros_(self.out.weight)  # a block starts as the identity
         nn.init.zeros_(last.weight)
 
     def forward(self, hidden: Tensor, near: Tensor, apart: Tensor) -> Tensor:
-        """(P, hidden), (P, k) their neighbours, (P, k, 6) how they lie -> (P, hidden)"""
+        """(P, hidden), (P, k) neighbours, (P, k, 6) relative positions -> (P, hidden)"""
         count, inner = near.shape[1], self.heads * self.width
         normed = self.norm(hidden)
         query = self.query(normed).view(-1, 1, self.heads, self.width)
-        key, value = self.seen(normed)[near].split(inner, dim=2)
+        key, value = self.key_value(normed)[near].split(inner, dim=2)
         bias, moved = self.where(apart).split([self.heads, inner], dim=2)
         weight = (query * key.view(-1, count, self.heads, self.width)).sum(dim=3) / self.width**0.5 + bias
         value = (value + moved).view(-1, count, self.heads, self.width)
@@ -146,16 +150,16 @@ class Neighbours(nn.Module):
 
 
 @torch.no_grad()
-def nearest(image: Tensor, place: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """The nearest keypoints of the same image, (P, k), and offset, direction and distance to each, (P, k, 6)."""
-    found, start = [], 0
+def find_nearest(image: Tensor, positions: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Return the nearest keypoints of the same image, (P, k), and offset, direction and distance to each, (P, k, 6)."""
+    neighbours, start = [], 0
     for many in torch.bincount(image).tolist():
-        here = place[start : start + many]
-        near = torch.cdist(here, here).topk(min(count, many), largest=False).indices
-        found.append(nnf.pad(near, (0, count - near.shape[1]), mode="replicate") + start)
+        own = positions[start : start + many]
+        near = torch.cdist(own, own).topk(min(count, many), largest=False).indices
+        neighbours.append(nnf.pad(near, (0, count - near.shape[1]), mode="replicate") + start)
         start += many
-    near = torch.cat(found)
-    offset = (place[near] - place[:, None]) / 16
+    near = torch.cat(neighbours)
+    offset = (positions[near] - positions[:, None]) / 16
     distance = offset.norm(dim=2, keepdim=True)
     shapes = [offset.clamp(-4, 4) / 2, offset / (distance + 1e-3), torch.log1p(distance), torch.exp(-distance)]
     return near, torch.cat(shapes, dim=2)
@@ -164,18 +168,20 @@ def nearest(image: Tensor, place: Tensor, count: int) -> tuple[Tensor, Tensor]:
 # ---- more photographs from fewer
 
 
-def zoomed(example: Example, share: float, rng: np.random.Generator) -> Example:
-    """Some square within the crop, its side at least `share` of the crop's, as large as the crop was. A descriptor is of the
-    keypoint's own scale, so that it stays nearly the same."""
+def zoom(example: Example, min_fraction: float, rng: np.random.Generator) -> Example:
+    """Enlarge a random square of the crop, with at least `min_fraction` of its side, to the size of the crop.
+
+    A descriptor has the scale of its keypoint, so it stays nearly the same.
+    """
     side = len(example.pixels)
-    window = int(rng.integers(round(share * side), side + 1))
+    window = int(rng.integers(round(min_fraction * side), side + 1))
     left, top = rng.integers(side - window + 1, size=2)
     moved = (example.release.keypoints - np.array([left, top], dtype=np.float32)) * np.float32(side / window)
     inside = np.all((moved >= 0) & (moved < side), axis=1)
     if not inside.any():
         return example
-    seen = example.pixels[top : top + window, left : left + window]
-    pixels = np.asarray(cv2.resize(seen, (side, side), interpolation=cv2.INTER_CUBIC), dtype=np.uint8)
+    cropped = example.pixels[top : top + window, left : left + window]
+    pixels = np.asarray(cv2.resize(cropped, (side, side), interpolation=cv2.INTER_CUBIC), dtype=np.uint8)
     assert isinstance(example.release, Descriptors)
     release = dataclasses.replace(
         example.release, positions=Points(keypoints=moved[inside]), descriptors=example.release.descriptors[inside], frames=None
@@ -183,25 +189,25 @@ def zoomed(example: Example, share: float, rng: np.random.Generator) -> Example:
     return dataclasses.replace(example, pixels=pixels, release=release)
 
 
-def relit(example: Example, most: float, rng: np.random.Generator) -> Example:
-    """Brighter or darker, of more or less contrast, up to a share: descriptors of normed gradients stay the same."""
-    contrast, brightness = 1 + rng.uniform(-most, most), rng.uniform(-most, most)
+def relight(example: Example, limit: float, rng: np.random.Generator) -> Example:
+    """Change brightness and contrast at random, up to `limit`. Descriptors of normalised gradients stay the same."""
+    contrast, brightness = 1 + rng.uniform(-limit, limit), rng.uniform(-limit, limit)
     pixels = np.clip((example.pixels / 255 - 0.5) * contrast + 0.5 + brightness, 0, 1)
     return dataclasses.replace(example, pixels=np.round(255 * pixels).astype(np.uint8))
 
 
-def thinned(points: EncodedRelease, share: float, rng: np.random.Generator) -> EncodedRelease:
-    """Without a share of the keypoints."""
-    kept = torch.from_numpy(rng.random(len(points.image)) >= share)
-    return dataclasses.replace(points, **{name: getattr(points, name)[kept] for name in ("values", "places", "image")})
+def drop_keypoints(points: EncodedRelease, fraction: float, rng: np.random.Generator) -> EncodedRelease:
+    """Drop a fraction of the keypoints at random."""
+    mask = torch.from_numpy(rng.random(len(points.image)) >= fraction)
+    return dataclasses.replace(points, **{name: getattr(points, name)[mask] for name in ("values", "coordinates", "image")})
 
 
 # ---- schedules
 
 
-def falling(last: float) -> Callable[[float], float]:
-    """The rate at its peak, and in the last share of the training falling to zero in a line."""
-    return lambda done: math.acos(2 * min(1.0, (1 - done) / last) - 1) / math.pi  # where the cosine is at that rate
+def create_linear_decay(last: float) -> Callable[[float], float]:
+    """Return a schedule with a linear decay to zero in the last fraction of the training."""
+    return lambda progress: math.acos(2 * min(1.0, (1 - progress) / last) - 1) / math.pi  # where the cosine has that rate
 
 
 # ---- ideas
@@ -209,45 +215,45 @@ def falling(last: float) -> Callable[[float], float]:
 
 @dataclass(frozen=True, kw_only=True)
 class Idea:
-    """What is done otherwise."""
+    """The differences from `bench train`."""
 
     shape: dict[str, Any] = field(default_factory=dict)
     attention: int = 0  # blocks
-    loss: dict[str, float] = field(default_factory=dict)
+    loss_weights: dict[str, float] = field(default_factory=dict)
     training: dict[str, Any] = field(default_factory=dict)
     photographs: int = 800
-    dropped: float = 0.0  # share of keypoints
-    zoomed: float = 1.0  # least share of a crop's side that is looked at
-    relit: float = 0.0  # share of the range by which brightness and contrast change, at most
+    dropped: float = 0.0  # fraction of keypoints
+    min_zoom: float = 1.0  # least fraction of a crop's side
+    lighting: float = 0.0  # maximum change of brightness and contrast, as a fraction of the range
     upright: bool = True
     turned: bool = True
-    schedule: Callable[[float], float] = float  # share of the training that is done -> where the cosine is then
+    schedule: Callable[[float], float] = float  # fraction of the training -> position on the cosine
 
-    def network(self) -> Inverter:
+    def build_network(self) -> Inverter:
         shape = Shape(**{"inputs": INPUTS} | self.shape)
         return Attentive(shape, self.attention) if self.attention else Inverter(shape)
 
-    def measured(self, reconstruction: Tensor, photograph: Tensor) -> Tensor:
-        return loss(reconstruction, photograph, **self.loss)
+    def compute_loss(self, reconstruction: Tensor, photograph: Tensor) -> Tensor:
+        return compute_loss(reconstruction, photograph, **self.loss_weights)
 
-    def drawn(self, examples: Examples, rng: np.random.Generator) -> Example:
+    def draw(self, examples: Examples, rng: np.random.Generator) -> Example:
         example = examples.draw(rng)
-        example = zoomed(example, self.zoomed, rng) if self.zoomed < 1 else example
-        return relit(example, self.relit, rng) if self.relit else example
+        example = zoom(example, self.min_zoom, rng) if self.min_zoom < 1 else example
+        return relight(example, self.lighting, rng) if self.lighting else example
 
 
 IDEAS = {
     UNCHANGED: Idea(),
-    "loss: rmse for l1": Idea(loss={"l1": 0.0, "rmse": 1.0}),
-    "loss: psnr beside l1": Idea(loss={"psnr": 0.05}),
-    "loss: coarser scales": Idea(loss={"coarse": 0.25}),
-    "loss: gradients": Idea(loss={"gradient": 0.5}),
-    "loss: more ssim": Idea(loss={"dissimilarity": 0.6}),
-    "loss: psnr for l1": Idea(loss={"l1": 0.0, "psnr": 0.05}),
-    "loss: what a classifier sees": Idea(loss={"classifier": 0.1}),
-    VGG: Idea(loss={"vgg": 0.1}),
-    "rate that falls in a line": Idea(schedule=falling(1.0)),
-    "rate that falls at the end": Idea(schedule=falling(0.3)),
+    "loss: rmse for l1": Idea(loss_weights={"l1": 0.0, "rmse": 1.0}),
+    "loss: psnr beside l1": Idea(loss_weights={"psnr": 0.05}),
+    "loss: coarser scales": Idea(loss_weights={"coarse": 0.25}),
+    "loss: gradients": Idea(loss_weights={"gradient": 0.5}),
+    "loss: more ssim": Idea(loss_weights={"dissimilarity": 0.6}),
+    "loss: psnr for l1": Idea(loss_weights={"l1": 0.0, "psnr": 0.05}),
+    "loss: what a classifier sees": Idea(loss_weights={"classifier": 0.1}),
+    VGG: Idea(loss_weights={"vgg": 0.1}),
+    "rate that falls in a line": Idea(schedule=create_linear_decay(1.0)),
+    "rate that falls at the end": Idea(schedule=create_linear_decay(0.3)),
     "rate 8e-3": Idea(training={"rate": 8e-3}),
     "rate 2e-3": Idea(training={"rate": 2e-3}),
     "batches of 4": Idea(training={"batch": 4}),
@@ -264,8 +270,8 @@ IDEAS = {
     "patches of 10": Idea(shape={"patch": 10}),
     "patches of 2": Idea(shape={"patch": 2}),
     "keypoint dropout": Idea(dropped=0.2),
-    "zoomed": Idea(zoomed=0.7),
-    "brightness and contrast": Idea(relit=0.1),
+    "zoomed": Idea(min_zoom=0.7),
+    "brightness and contrast": Idea(lighting=0.1),
     "attention": Idea(attention=2),
     f"{UNCHANGED}; 200 photographs": Idea(photographs=200),
     f"{UNCHANGED}; 400 photographs": Idea(photographs=400),
@@ -283,39 +289,39 @@ IDEAS = {
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True, help="the folder of tune.txt and train/")
-    parser.add_argument("--work", type=Path, required=True, help="features are kept here")
-    parser.add_argument("--idea", choices=IDEAS, action="append", help="one to try, may be repeated; all that can be by default")
-    parser.add_argument("--seconds", type=float, default=600, help="of processor time, all threads together, for each")
-    parser.add_argument("--start", type=Path, help="a network for raw descriptors to start from, instead of random weights")
+    parser.add_argument("--work", type=Path, required=True, help="folder of features, reused between runs")
+    parser.add_argument("--idea", choices=IDEAS, action="append", help="idea to test, may be repeated; default: all available")
+    parser.add_argument("--seconds", type=float, default=600, help="processor time per idea, over all threads")
+    parser.add_argument("--initial-checkpoint", type=Path, help="a network for raw descriptors, instead of random weights")
     args = parser.parse_args()
     for name in args.idea or [name for name in IDEAS if name != VGG or vgg_file().is_file()]:
         try:
-            record = {"idea": name, "date": time.strftime("%Y-%m-%d"), **tried(IDEAS[name], args)}
+            record = {"idea": name, "date": time.strftime("%Y-%m-%d"), **try_idea(IDEAS[name], args)}
         except UserError as error:
             parser.error(str(error))
         print(record, flush=True)
         with LOG.open("a", encoding="utf-8") as log:
             log.write(json.dumps(record) + "\n")
-        PAGE.write_text(page([json.loads(line) for line in LOG.read_text(encoding="utf-8").splitlines()]), encoding="utf-8")
+        PAGE.write_text(write_page([json.loads(line) for line in LOG.read_text(encoding="utf-8").splitlines()]), encoding="utf-8")
 
 
-def tried(idea: Idea, args: argparse.Namespace) -> dict[str, Any]:
-    """Train for as long as is given, and score the averaged weights."""
-    photographs, tune = (seen(args, which, idea.upright) for which in ("012", "tune"))
-    known = find_symmetries(Sift(upright=idea.upright))
-    under = known if idea.turned else (IDENTITY,)
+def try_idea(idea: Idea, args: argparse.Namespace) -> dict[str, Any]:
+    """Train for the given time, and score the averaged weights."""
+    photographs, tune = (load_views(args, which, idea.upright) for which in ("012", "tune"))
+    symmetries = find_symmetries(Sift(upright=idea.upright))
+    under = symmetries if idea.turned else (IDENTITY,)
     examples = Examples(photographs[: 4 * idea.photographs], Undefended(), {}, {}, Public(), under)
     unseen = Examples(tune, Undefended(), {}, {}, Public())
     torch.manual_seed(0)
-    network, training = idea.network(), {"warmup": WARMUP, **idea.training}
+    network, training = idea.build_network(), {"warmup": WARMUP, **idea.training}
     if args.initial_checkpoint:
         network.load_state_dict(weights.load(args.initial_checkpoint).module.state_dict())
-        training = {"rate": 1e-3, **training}  # as tools/make_assets.py goes on from its start
-    learner = Learner(network, Training(**training), idea.measured)
+        training = {"rate": 1e-3, **training}  # as in the second stage of tools/make_assets.py
+    learner = Learner(network, Training(**training), idea.compute_loss)
     crops = fit(learner, examples, idea, args.seconds)
     network = learner.load_average()
     scores = validate(network, unseen, tune[::4], 1, "invariant")
-    averaged = shown(network, known, tune[::4])
+    averaged = score_average(network, symmetries, tune[::4])
     parameters = sum(weight.numel() for weight in network.parameters())
     return {
         "upright": idea.upright,
@@ -330,109 +336,108 @@ def tried(idea: Idea, args: argparse.Namespace) -> dict[str, Any]:
 
 
 def fit(learner: Learner[Inverter], examples: Examples, idea: Idea, seconds: float) -> int:
-    """Train for as long as is given. -> crops seen"""
-    started, told = time.process_time(), 0
+    """Train for the given time. -> number of training samples"""
+    started, reported = time.process_time(), 0
     with Progress("training", round(seconds)) as progress:
-        while (share := (time.process_time() - started) / seconds) < 1:
+        while (fraction := (time.process_time() - started) / seconds) < 1:
             rng = np.random.default_rng([0, learner.step])
-            points, photographs = build_batch([idea.drawn(examples, rng) for _ in range(learner.training.batch)], 1, "invariant")
-            points = thinned(points, idea.dropped, rng) if idea.dropped else points
-            value = float(learner.learn(points, photographs, idea.schedule(share)))
-            progress.advance(int(seconds * share) - told, f"loss {value:.4f}, {learner.step} steps")
-            told = int(seconds * share)
+            points, photographs = build_batch([idea.draw(examples, rng) for _ in range(learner.training.batch)], 1, "invariant")
+            points = drop_keypoints(points, idea.dropped, rng) if idea.dropped else points
+            value = float(learner.learn(points, photographs, idea.schedule(fraction)))
+            progress.advance(int(seconds * fraction) - reported, f"loss {value:.4f}, {learner.step} steps")
+            reported = int(seconds * fraction)
     return learner.step * learner.training.batch
 
 
-def shown(network: nn.Module, known: Sequence[Symmetry], views: Sequence[PhotographView]) -> dict[str, float]:
-    """Mean SSIM and PSNR of the average of what is painted under all symmetries, as `dia` shows it."""
+def score_average(network: nn.Module, symmetries: Sequence[Symmetry], views: Sequence[PhotographView]) -> dict[str, float]:
+    """Return mean SSIM and PSNR of reconstructions averaged over symmetries, as in `dia`."""
     scores = []
     for view in views:
         raw = view.features
         release = Descriptors(positions=Points(keypoints=raw.keypoints), size=raw.size, descriptors=raw.descriptors)
-        image = reconstruct_image(network, release, known, np.empty(0, np.float32), 1, "invariant")
+        image = reconstruct_image(network, release, symmetries, np.empty(0, np.float32), 1, "invariant")
         scores.append(score(*(torch.from_numpy(pixels).permute(2, 0, 1) for pixels in (image, view.pixels / np.float32(255)))))
     _, similarity, psnr = np.mean(scores, axis=0)
-    return {"times": len(known), "ssim": float(similarity), "psnr": float(psnr)}
+    return {"times": len(symmetries), "ssim": float(similarity), "psnr": float(psnr)}
 
 
-def seen(args: argparse.Namespace, which: str, upright: bool) -> list[PhotographView]:
-    """All views of a set of photographs, extracted once."""
-    kept = args.work / f"{which}-{'upright' if upright else 'oriented'}.pickle"
-    if not kept.is_file():
+def load_views(args: argparse.Namespace, which: str, upright: bool) -> list[PhotographView]:
+    """Load all views of a set of photographs; they are extracted once."""
+    cache = args.work / f"{which}-{'upright' if upright else 'oriented'}.pickle"
+    if not cache.is_file():
         args.work.mkdir(parents=True, exist_ok=True)
-        folders = part(args.data, args.work / "photographs")
-        kept.write_bytes(pickle.dumps(collect_views(list_photographs(folders[which]), Sift(upright=upright))))
-    found: list[PhotographView] = pickle.loads(kept.read_bytes())
-    return found
+        folders = split_photographs(args.data, args.work / "photographs")
+        cache.write_bytes(pickle.dumps(collect_views(list_photographs(folders[which]), Sift(upright=upright))))
+    views: list[PhotographView] = pickle.loads(cache.read_bytes())
+    return views
 
 
-def page(records: Sequence[dict[str, Any]]) -> str:
-    """docs/ideas.md: what was trained equally long stands together, the best first."""
+def write_page(records: Sequence[dict[str, Any]]) -> str:
+    """Write docs/ideas.md: trainings grouped by their time, the best first."""
     lines = [
         "# Ideas for the inversion network",
         "",
-        "Written by `tools/training_ideas.py`, which says what each idea is. Raw descriptors; trainings in equal processor time, from "
-        "random weights but where a start is named; scores on the 100 photographs of `tune.txt` (SSIM where its window fits). "
-        "Short trainings favour what learns fast, and each was done once: read small differences as none. *Shown*: painted of "
-        "what the photograph mirrored, or turned, too, would have released, so many times, and averaged. *Earlier*: another "
-        "layout or optimizer, which the history of this repository has, but for Muon without two layers, of which the name says "
-        "all. Trainings of more than 10 minutes are `bench train`'s, and their minutes its threads' by the clock; "
-        "what is shipped was trained in legs, each from where the one before ended.",
+        "Written by `tools/training_ideas.py`, which says what each idea is. Raw descriptors; "
+        "trainings in equal processor time, from random weights unless an initial checkpoint is named; "
+        "scores on the 100 photographs of `tune.txt` (SSIM where its window fits). "
+        "Short trainings favour fast learners, and each was done once: ignore small differences. *Shown*: the mean over "
+        "reconstructions from the releases of the mirrored and rotated photograph, with their number. *Earlier*: another "
+        "layout or optimizer, which is in the history of this repository, except for Muon without two layers, which the name "
+        "describes. Trainings of more than 10 minutes are `bench train`'s, with their minutes as wall time of its threads; "
+        "the shipped networks were trained in stages, each from the result of the one before.",
     ]
-    for group in sorted({equal(record) for record in records}):
+    for group in sorted({describe_group(record) for record in records}):
         oriented, seconds, start = group
-        here = [record for record in records if equal(record) == group]
+        members = [record for record in records if describe_group(record) == group]
         kind, origin = "Oriented" if oriented else "Upright", f", from `{start}`" if start else ""
         lines += ["", f"## {kind} SIFT, {seconds / 60:g} minutes of one core{origin}", ""]
         lines += [markdown_row(("idea", "MAE", "SSIM, PSNR", "shown", *SIZES))]
         lines += [markdown_row(["---"] * 8)]
-        for record in sorted(here, key=lambda record: -record["ssim"]):
+        for record in sorted(members, key=lambda record: -record["ssim"]):
             averaged = record["shown"]
             scores = [f"{record['mae']:.4f}", f"{record['ssim']:.4f}, {record['psnr']:.2f}"]
             scores += [f"{averaged['ssim']:.4f}, {averaged['psnr']:.2f} ({averaged['times']})"]
             sizes = f"{record['crops']:,}", f"{record['parameters'] / 1e6:.1f} M"
             lines.append(markdown_row((record["idea"], *scores, *sizes, record["trained_on"], record["date"])))
     alone = [record for record in records if record["upright"] and not record.get("start")]
-    lines += ["", "## How the gap closes", "", "Painted once; upright, from random weights, where nothing else is said."]
+    lines += ["", "## How the gap closes", "", "One reconstruction; upright, from random weights, unless stated otherwise."]
     for idea in (UNCHANGED, UNTURNED):
         whole = [record for record in alone if record["idea"] == idea]
         fewer = [record for record in alone if record["idea"] in (f"{idea}; 200 photographs", f"{idea}; 400 photographs")]
         longest = max((record["seconds"] for record in fewer), default=0)
         same = [record for record in whole if record["seconds"] == longest]
-        lines += extrapolation(f"{idea.capitalize()}, the more crops", whole, "crops")
-        lines += extrapolation(
-            f"{idea.capitalize()}, the more photographs, in {longest / 60:g} minutes", fewer + same, "trained_on"
-        )
+        lines += extrapolate(f"{idea.capitalize()}, by training samples", whole, "crops")
+        lines += extrapolate(f"{idea.capitalize()}, by photographs, in {longest / 60:g} minutes", fewer + same, "trained_on")
     for upright, first in ((True, UNTURNED), (False, f"{UNTURNED}; oriented")):
         same = [record for record in records if record["upright"] == upright]
-        legs = [record for record in same if record["idea"] == first and not record.get("start")]
-        # `before`: the crops that its start had seen, in rows of `bench train`, which are added by hand.
-        legs += [record | {"crops": record["before"] + record["crops"]} for record in same if "before" in record]
+        stages = [record for record in same if record["idea"] == first and not record.get("start")]
+        # `before`: training samples of the initial checkpoint, in rows of `bench train`, which are added by hand.
+        stages += [record | {"crops": record["before"] + record["crops"]} for record in same if "before" in record]
         kind = "upright" if upright else "oriented"
-        lines += extrapolation(f"Leg by leg, {kind}, the first not turned, the more crops in all", legs, "crops")
+        lines += extrapolate(f"By training stages, {kind}, the first not turned, by training samples in all", stages, "crops")
     return "\n".join(lines) + "\n"
 
 
-def equal(record: dict[str, Any]) -> tuple[bool, float, str]:
-    """What trainings that are compared have in common."""
+def describe_group(record: dict[str, Any]) -> tuple[bool, float, str]:
+    """Return the common settings of trainings that are compared."""
     return not record["upright"], record["seconds"], record.get("start") or ""
 
 
-def extrapolation(told: str, trained: Sequence[dict[str, Any]], by: str) -> list[str]:
-    """How scores grow with what is kept under `by`, and how much of it the paper's would take if that went on."""
+def extrapolate(title: str, trained: Sequence[dict[str, Any]], by: str) -> list[str]:
+    """Write how scores grow with the key `by`, and its extrapolated value for the scores of the paper."""
     ordered, name = sorted(trained, key=lambda one: one[by]), "photographs" if by == "trained_on" else by
-    if not ordered or ordered[-1][by] < 2 * ordered[0][by]:  # too near to each other for a line
+    if not ordered or ordered[-1][by] < 2 * ordered[0][by]:  # too close for a fit
         return []
     table = [markdown_row((name, "SSIM", "PSNR")), markdown_row(["---"] * 3)]
     table += [markdown_row((f"{one[by]:,}", f"{one['ssim']:.4f}", f"{one['psnr']:.2f}")) for one in ordered]
     logs = np.log2([one[by] for one in ordered])
-    said = []
+    statements = []
     for metric, (paper, digits) in PAPER.items():
         slope, offset = np.polyfit(logs, [one[metric] for one in ordered], 1)
         grown = f"{metric.upper()} grows by {slope:.{digits}f} for each doubling"
-        said.append(f"{grown}, and would be the paper's {paper} after {2 ** ((paper - offset) / slope):.1e} {name}")
-    line = f"By a line through these {len(ordered)}, {'; '.join(said)}. That is an extrapolation, and no measurement."
-    return ["", f"{told}:", "", *table, "", line]
+        statements.append(f"{grown}, and would be the paper's {paper} after {2 ** ((paper - offset) / slope):.1e} {name}")
+    line = f"By a line through these {len(ordered)}, {'; '.join(statements)}. That is an extrapolation, and no measurement."
+    return ["", f"{title}:", "", *table, "", line]
 
 
 if __name__ == "__main__":

@@ -2,10 +2,10 @@
 
     python tools/tune_attacks.py --data ../shared/data [--attack database]
 
-Every setting of an attack's grid recovers the descriptors of the same releases: at each point of the defense, some keypoints of
-each photograph, or all of a few where releases of others are looked at as well. The chosen setting has the smallest angle to the
-true descriptors, averaged over the points; beside it stands what the best setting of each point would gain, and where releases of
-others are looked at, the coverage that the attack believes to have. To have another attack tuned, add it to TUNINGS.
+Every setting of an attack's grid recovers the descriptors of the same releases: at each setting of the defense, some keypoints of
+each photograph, or all of a few for attacks that use other releases. The chosen setting has the smallest angle to the true
+descriptors, averaged over the settings of the defense. The tables also show the gain of the best setting at each of them and, for
+attacks that use other releases, the coverage that the attack estimates. To tune another attack, add it to TUNINGS.
 """
 
 from __future__ import annotations
@@ -59,71 +59,74 @@ Tried = tuple[Floats, float]
 
 @dataclass(frozen=True, kw_only=True)
 class Tuning:
-    """An attack, the settings to try, and the points of a defense to try them at."""
+    """An attack, its grid of settings, and the size of the sample."""
 
     attack: type[DescriptorAttack]
     grid: Mapping[str, Sequence[Any]]
     photographs: int  # of tune.txt
     keypoints: int | None  # of each, or all
-    # What all settings make of one view. They share what work they can.
+    # Yields the estimates of all settings for one view; the settings share work.
     recover: Callable[[View, Sequence[Any]], Iterator[Tried]]
 
     @property
     def settings(self) -> dict[str, DescriptorAttack]:
-        """Every combination of the grid that the attack takes, by how it is written on the command line."""
-        made = {}
+        """Every valid combination of the grid, by its text on the command line."""
+        settings = {}
         for values in itertools.product(*self.grid.values()):
             given = dict(zip(self.grid, values, strict=True))
             with suppress(UserError):
-                made[",".join(f"{field}={value}" for field, value in given.items())] = self.attack(**given)
-        return made
+                settings[",".join(f"{field}={value}" for field, value in given.items())] = self.attack(**given)
+        return settings
 
 
-def recover_by_database(seen: View, settings: Sequence[Database]) -> Iterator[Tried]:
-    """One search for all: fewer neighbours are the first of many."""
-    release, adversarial = require_subspaces(seen)
-    words = seen.know(DefenseDatabase).words
+def recover_by_database(view: View, settings: Sequence[Database]) -> Iterator[Tried]:
+    """Recover with one search for all settings: fewer neighbours are the first of many."""
+    release, adversarial = require_subspaces(view)
+    words = view.know(DefenseDatabase).words
     most = max(attack.neighbours for attack in settings)
-    found, distances = find_nearest_to_subspaces(release, words, adversarial + most)
+    nearest, distances = find_nearest_to_subspaces(release, words, adversarial + most)
     for attack in settings:
         few = slice(adversarial + attack.neighbours)
-        yield estimate(release, words, found[:, few], distances[:, few], adversarial, attack.estimators), np.nan
+        yield estimate(release, words, nearest[:, few], distances[:, few], adversarial, attack.estimators), np.nan
 
 
-def recover_by_clustering(seen: View, settings: Sequence[Clustering]) -> Iterator[Tried]:
-    """One search, one clustering for each |V|, and one company for each c."""
-    release, adversarial = require_subspaces(seen)
-    z = seen.know(PublicDatabase).words
-    found, distances = find_nearest_to_subspaces(release, z, max(attack.neighbours for attack in settings))
+def recover_by_clustering(view: View, settings: Sequence[Clustering]) -> Iterator[Tried]:
+    """Recover with one search, one clustering per |V|, and one shared sub-database per c."""
+    release, adversarial = require_subspaces(view)
+    z = view.know(PublicDatabase).words
+    nearest, distances = find_nearest_to_subspaces(release, z, max(attack.neighbours for attack in settings))
 
     @functools.cache
-    def of(neighbours: int) -> Any:
-        return build_candidates(release, z, found[:, :neighbours], distances[:, :neighbours], adversarial + 1)
+    def build(neighbours: int) -> Any:
+        return build_candidates(release, z, nearest[:, :neighbours], distances[:, :neighbours], adversarial + 1)
 
-    shared = companies(seen)
+    shared = create_sub_database_finder(view)
     for attack in settings:
-        kept = shared(attack.others, attack.coverage)
-        yield select_candidates(of(attack.neighbours), kept), kept.coverage
+        sub_database = shared(attack.others, attack.coverage)
+        yield select_candidates(build(attack.neighbours), sub_database), sub_database.coverage
 
 
-def recover_by_intersection(seen: View, settings: Sequence[Intersection]) -> Iterator[Tried]:
-    """One company and one rebuilt database for each c."""
-    release, adversarial = require_subspaces(seen)
-    shared = companies(seen)
+def recover_by_intersection(view: View, settings: Sequence[Intersection]) -> Iterator[Tried]:
+    """Recover with one shared sub-database and one reconstructed database per c."""
+    release, adversarial = require_subspaces(view)
+    shared = create_sub_database_finder(view)
 
     @functools.cache
     def words(others: int, coverage: float) -> Any:
         return reconstruct_database(find_intersections_within(shared(others, coverage).subspaces))
 
     for attack in settings:
-        asked = attack.others, attack.coverage
-        yield estimate_descriptors(release, words(*asked), adversarial, attack.neighbours, attack.estimators), shared(*asked).coverage
+        limits = attack.others, attack.coverage
+        yield (
+            estimate_descriptors(release, words(*limits), adversarial, attack.neighbours, attack.estimators),
+            shared(*limits).coverage,
+        )
 
 
-def companies(seen: View) -> Callable[[int, float], SharedSubDatabase]:
-    """From c and the share that is enough to the company of the release, each found once."""
-    release, adversarial = require_subspaces(seen)
-    others = seen.know(OtherReleases).draw
+def create_sub_database_finder(view: View) -> Callable[[int, float], SharedSubDatabase]:
+    """Return a function from c and the sufficient coverage to the shared sub-database of the release, each computed once."""
+    release, adversarial = require_subspaces(view)
+    others = view.know(OtherReleases).draw
     return functools.cache(lambda count, enough: find_shared_sub_database(release, others(count), adversarial, enough))
 
 
@@ -161,17 +164,17 @@ def main() -> None:
     sources = [Source(name, args.data / "train" / name) for name in (args.data / "tune.txt").read_text().split()]
     for tuning in TUNINGS:
         if tuning.attack.name() in (args.attack or names):
-            section = report(tuning, measure(tuning, sources))
+            section = write_section(tuning, measure(tuning, sources))
             print(section)
-            write(tuning.attack.name(), section)
+            save_section(tuning.attack.name(), section)
 
 
 def measure(tuning: Tuning, sources: Sequence[Source]) -> np.ndarray:
-    """Angle, share recovered, and coverage. -> (points, settings, photographs, 3)"""
+    """Measure angle, fraction recovered, and coverage. -> (points, settings, photographs, 3)"""
     public, extractor = Public(), Sift()
     defenses = [spec.read(point, discovery.DEFENSE) for point in POINTS]
-    populations = [
-        ReleasePool(sources, extractor, defense, public, functools.partial(drawn, point))
+    pools = [
+        ReleasePool(sources, extractor, defense, public, functools.partial(create_generator, point))
         for point, defense in enumerate(defenses)
     ]
     settings = list(tuning.settings.values())
@@ -185,22 +188,24 @@ def measure(tuning: Tuning, sources: Sequence[Source]) -> np.ndarray:
                 secret = secret.take(np.sort(rng.choice(len(secret), min(tuning.keypoints, len(secret)), replace=False)))
             for point, defense in enumerate(defenses):
                 release = defense.protect(secret, public, np.random.default_rng([number, point]))
-                others = populations[point].without(source.name)
-                known = offer_knowledge(settings[0], defense, public) | {OtherReleases: lambda others=others: OtherReleases(draw=others)}
-                seen = View(release=release, defense=defense, extractor=extractor, knowledge=known)
-                for setting, (found, coverage) in enumerate(tuning.recover(seen, settings)):
-                    values[point, setting, number] = [*(metric(secret.descriptors, found) for metric in METRICS), coverage]
+                others = pools[point].without(source.name)
+                knowledge = offer_knowledge(settings[0], defense, public) | {
+                    OtherReleases: lambda others=others: OtherReleases(draw=others)
+                }
+                view = View(release=release, defense=defense, extractor=extractor, knowledge=knowledge)
+                for setting, (estimates, coverage) in enumerate(tuning.recover(view, settings)):
+                    values[point, setting, number] = [*(metric(secret.descriptors, estimates) for metric in METRICS), coverage]
                 progress.advance()
     return values
 
 
-def drawn(point: int, *parts: object) -> np.random.Generator:
-    """A generator for each release of the population of one point."""
+def create_generator(point: int, *parts: object) -> np.random.Generator:
+    """Create a generator for each other release at one setting of the defense."""
     return np.random.default_rng([point, *str(parts).encode()])
 
 
-def report(tuning: Tuning, measured: np.ndarray) -> str:
-    """A section of docs/tuning.md. (points, settings, photographs, 3)"""
+def write_section(tuning: Tuning, measured: np.ndarray) -> str:
+    """Write a section of docs/tuning.md. (points, settings, photographs, 3)"""
     angles = measured[..., 0].mean(axis=2)  # (points, settings)
     settings = list(tuning.settings)
     best = int(angles.mean(axis=0).argmin())
@@ -221,27 +226,33 @@ def report(tuning: Tuning, measured: np.ndarray) -> str:
         lost = values[best, :, 0] - values[there, :, 0]  # (photographs,)
         error = lost.std(ddof=1) / len(lost) ** 0.5
         lines.append(
-            row(f"`{point}`", cell(values[best]), cell(values[there]), settings[there], f"{lost.mean():.2f} ± {error:.2f}")
+            format_row(
+                f"`{point}`",
+                format_cell(values[best]),
+                format_cell(values[there]),
+                settings[there],
+                f"{lost.mean():.2f} ± {error:.2f}",
+            )
         )
-    lines += ["", row("setting", *(f"`{point}`" for point in POINTS), "mean angle")]
-    lines.append(row(*["---"] * (len(POINTS) + 2)))
+    lines += ["", format_row("setting", *(f"`{point}`" for point in POINTS), "mean angle")]
+    lines.append(format_row(*["---"] * (len(POINTS) + 2)))
     for number, name in enumerate(settings):
-        lines.append(row(name, *(cell(values[number]) for values in measured), f"{angles[:, number].mean():.2f}"))
+        lines.append(format_row(name, *(format_cell(values[number]) for values in measured), f"{angles[:, number].mean():.2f}"))
     return "\n".join(lines) + "\n"
 
 
-def cell(values: np.ndarray) -> str:
-    """(photographs, 3)"""
-    angle, share, coverage = values.mean(axis=0)
-    return f"{angle:.2f}° {share:.3f}" + ("" if np.isnan(coverage) else f", {coverage:.2f}")
+def format_cell(values: np.ndarray) -> str:
+    """Format the means of (photographs, 3)."""
+    angle, fraction, coverage = values.mean(axis=0)
+    return f"{angle:.2f}° {fraction:.3f}" + ("" if np.isnan(coverage) else f", {coverage:.2f}")
 
 
-def row(*cells: str) -> str:
+def format_row(*cells: str) -> str:
     return f"| {' | '.join(cells)} |"
 
 
-def write(name: str, section: str) -> None:
-    """Put the section in the place of the attack's former one, or at the end."""
+def save_section(name: str, section: str) -> None:
+    """Replace the section of the attack, or append it."""
     parts = TABLE.read_text(encoding="utf-8").split("\n## ") if TABLE.is_file() else [TITLE]
     sections = dict(part.split("\n", 1) for part in parts[1:]) | {name: "\n" + section}
     text = "".join(f"\n## {title}\n{body.rstrip()}\n" for title, body in sections.items())

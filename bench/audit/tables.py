@@ -4,41 +4,30 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from rich.table import Table
-from rich.text import Text
-
 from bench.audit.auditor import Audit
 from bench.audit.findings import CERTAINTY, CONFIDENCE
+from bench.core.table import Table, build_table
 
 
-def report(audit: Audit, defense: str) -> Iterator[Text | Table]:
+def report(audit: Audit, defense: str) -> Iterator[Table | str]:
     """Yield the findings and the verdict."""
     unit = " per unit of distance" if audit.by_distance else ""
-    table = Table(
-        title=Text(f"{defense} claims ε = {audit.claimed:g}{unit}"),
-        caption=Text("\n".join(audit.notes)),
-        title_justify="left",
-        caption_justify="left",
-    )
-    for column in ("events", "most informative event"):
-        table.add_column(column, overflow="fold")
-    for column in ("rate", "rate of the other", "trials each", f"ε{unit} at least ({CONFIDENCE:.0%})"):
-        table.add_column(column, justify="right")
-    for finding in audit.findings:
-        one, other = finding.rates
-        table.add_row(
-            Text(finding.family), Text(finding.event), f"{one:.5g}", f"{other:.5g}", str(finding.trials), f"{finding.epsilon:.4f}"
-        )
-    yield table
+    text = ("events", "most informative event")
+    columns = (*text, "rate", "rate of the other", "trials each", f"ε{unit} at least ({CONFIDENCE:.0%})")
+    rows = [
+        (finding.family, finding.event, *(f"{rate:.5g}" for rate in finding.rates), str(finding.trials), f"{finding.epsilon:.4f}")
+        for finding in audit.findings
+    ]
+    yield build_table(columns, rows, text=text, heading=f"{defense} claims ε = {audit.claimed:g}{unit}", remarks=audit.notes)
     if audit.enumeration is not None:
         least, most = audit.enumeration.low, audit.enumeration.high
         power = "e^(ε d)" if audit.by_distance else "e^ε"
-        yield Text(
+        yield (
             "all outputs enumerated: the greatest probability ratio of two words is "
             f"{power} for ε from {least:.15g} to {most:.15g}"
         )
     bound = f"ε is at least {audit.strongest.epsilon:.4f} with confidence {CONFIDENCE:.0%}, by {audit.strongest.family}"
-    yield Text(f"{bound}: {_describe_verdict(audit)}")
+    yield f"{bound}: {_describe_verdict(audit)}"
 
 
 def _describe_verdict(audit: Audit) -> str:

@@ -6,6 +6,7 @@ involved. Of the secret it holds only what was released. The attack never sees t
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import time
 from dataclasses import dataclass
@@ -103,13 +104,20 @@ def _key(attack: Attack, trial: Trial) -> dict[str, Any]:
 
 
 def _hash_release(release: Release) -> str:
-    """Hash all fields of a release."""
-    hashed = hashlib.sha256(type(release).__name__.encode())
-    for name, value in sorted(vars(release).items()):
-        hashed.update(name.encode())
-        if isinstance(value, np.ndarray):
-            hashed.update(f"{value.dtype} {value.shape}".encode())
-            hashed.update(np.ascontiguousarray(value).data)
+    """Hash all fields of a release, those of its positions too."""
+    hashed = hashlib.sha256()
+
+    def update(part: Any) -> None:
+        hashed.update(type(part).__name__.encode())
+        if isinstance(part, np.ndarray):
+            hashed.update(f"{part.dtype} {part.shape}".encode())
+            hashed.update(np.ascontiguousarray(part).data)
+        elif dataclasses.is_dataclass(part):
+            for field in dataclasses.fields(part):
+                hashed.update(field.name.encode())
+                update(getattr(part, field.name))
         else:
-            hashed.update(repr(value).encode())
+            hashed.update(repr(part).encode())
+
+    update(release)
     return hashed.hexdigest()

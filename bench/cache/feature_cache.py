@@ -13,7 +13,6 @@ from concurrent.futures import ProcessPoolExecutor
 from typing import Any
 
 import numpy as np
-import torch
 
 from bench.api import Extractor
 from bench.cache import provenance, store
@@ -56,6 +55,8 @@ def extract_all(extractor: Extractor, images: Sequence[Pixels]) -> Iterator[Feat
     SampleError
         if one of them cannot be read.
     """
+    import torch
+
     missing = [image for image in images if not store.entry_path(KIND, _key(extractor, image)).is_file()]
     processes = torch.get_num_threads()
     if len(missing) > MAX_SEQUENTIAL and processes > 1:

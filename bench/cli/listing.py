@@ -6,12 +6,13 @@ import dataclasses
 from collections.abc import Iterator
 from typing import Any
 
-from rich.table import Table
+from rich.table import Table as RichTable
 from rich.text import Text
 
 from bench.api import Plugin
 from bench.codebook.public import Public
 from bench.core.errors import UserError
+from bench.core.table import Table, build_table
 from bench.registry import discovery, fields, spec
 from bench.registry.discovery import Kind
 
@@ -25,7 +26,7 @@ SECTIONS: dict[str, Kind] = {
 }
 
 
-def build_listing(section: str | None) -> Iterator[Table | Text]:
+def build_listing(section: str | None) -> Iterator[Table | RichTable | Text]:
     """Yield one section, or all sections and the matrix of attacks and defenses.
 
     Raises
@@ -38,14 +39,14 @@ def build_listing(section: str | None) -> Iterator[Table | Text]:
         for plugin in discovery.load_plugins(SECTIONS[name]):
             yield from _describe(plugin)
     if section in (None, "defenses", "attacks"):
-        yield from _build_matrix()
+        yield _build_matrix()
 
 
-def _describe(plugin: type[Plugin]) -> Iterator[Table | Text]:
+def _describe(plugin: type[Plugin]) -> Iterator[RichTable | Text]:
     yield Text.assemble("  ", (plugin.name(), "bold"), f"  {plugin.description()}")
     if not dataclasses.fields(plugin):  # type: ignore[arg-type]
         return
-    table = Table(box=None, show_header=False, padding=(0, 2, 0, 0), pad_edge=False)
+    table = RichTable(box=None, show_header=False, padding=(0, 2, 0, 0), pad_edge=False)
     types = fields.resolve_types(plugin)
     for field in dataclasses.fields(plugin):  # type: ignore[arg-type]
         default = "required" if field.default is dataclasses.MISSING else f"default {_format(field.default)}"
@@ -57,18 +58,18 @@ def _format(value: Any) -> str:
     return str(value).lower() if isinstance(value, bool) or value is None else str(value)
 
 
-def _build_matrix() -> Iterator[Table | Text]:
-    """Yield the table of which attack applies to which defense, all with default fields."""
+def _build_matrix() -> Table:
+    """Return the table of which attack applies to which defense, all with default fields."""
     public = Public()
     task, extractor = spec.read("reconstruction", discovery.TASK), spec.read("sift", discovery.EXTRACTOR)
-    table = Table(title="which attack applies to which defense (with default fields)", title_justify="left")
-    for column in ("defense", "attack", "applies", "reason"):
-        table.add_column(column, overflow="fold")
-    for defense in discovery.load_plugins(discovery.DEFENSE):
-        for attack in discovery.load_plugins(discovery.ATTACK):
+    defenses, attacks = discovery.load_plugins(discovery.DEFENSE), discovery.load_plugins(discovery.ATTACK)
+    rows = []
+    for defense in defenses:
+        for attack in attacks:
             try:
                 reason = task.explain_not_applicable(spec.build(defense, {}), spec.build(attack, {}), extractor, public)
             except UserError as error:  # a required field or a file is missing
                 reason = str(error)
-            table.add_row(Text(defense.name()), Text(attack.name()), "no" if reason else "yes", Text(reason or ""))
-    yield table
+            rows.append((defense.name(), attack.name(), "no" if reason else "yes", reason or ""))
+    columns = ("defense", "attack", "applies", "reason")
+    return build_table(columns, rows, text=columns, heading="which attack applies to which defense (with default fields)")

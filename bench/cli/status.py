@@ -6,15 +6,16 @@ import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 
-from rich.table import Table
-from rich.text import Text
-
+from bench.core.table import Table, build_table
 from bench.runner import directory
 from bench.runner.status import read_status, summarize
 from leaderboard.tables import build_labels
 
+COLUMNS = ("task", "defense", "attack", "seed", "done", "running", "failed", "missing", "n/a")
+TEXT = ("task", "defense", "attack", "n/a")  # the other columns are numbers
 
-def build_status_table(out: Path) -> Iterator[Table | Text]:
+
+def build_status_table(out: Path) -> Iterator[Table | str]:
     """Yield the status of the run in a folder.
 
     Raises
@@ -24,22 +25,17 @@ def build_status_table(out: Path) -> Iterator[Table | Text]:
     """
     run = read_status(out)
     names = build_labels([(experiment.metadata["defense"], experiment.metadata["attack"]) for experiment in run.experiments])
-    yield Text(f"{out}: {summarize(run)}")
-    table = Table()
-    for column in ("task", "defense", "attack", "seed", "done", "running", "failed", "missing", "n/a"):
-        table.add_column(column, overflow="fold", justify="left" if column in ("task", "defense", "attack", "n/a") else "right")
+    yield f"{out}: {summarize(run)}"
+    rows = []
     for experiment, (defense, attack) in zip(run.experiments, names, strict=True):
         counts = ["n/a"] * 4 if experiment.reason else list(map(str, dataclasses.astuple(experiment.count)))
-        row = (experiment.metadata["task"], defense, attack, str(experiment.metadata["seed"]), *counts, experiment.reason or "")
-        table.add_row(*map(Text, row))
-    yield table
+        metadata = experiment.metadata
+        rows.append((metadata["task"], defense, attack, str(metadata["seed"]), *counts, experiment.reason or ""))
+    yield build_table(COLUMNS, rows, text=TEXT)
 
 
 def build_overview_table(folder: Path) -> Table:
     """Return a table with the status of every run in a folder."""
-    table = Table(title=Text(str(folder)), title_justify="left")
-    for column in ("run", "status"):
-        table.add_column(column, overflow="fold")
-    for plan in sorted(folder.glob(f"*/{directory.PLAN}")):
-        table.add_row(Text(plan.parent.name), Text(summarize(read_status(plan.parent))))
-    return table
+    runs = (plan.parent for plan in sorted(folder.glob(f"*/{directory.PLAN}")))
+    rows = ((run.name, summarize(read_status(run))) for run in runs)
+    return build_table(("run", "status"), rows, text=("run", "status"), heading=str(folder))

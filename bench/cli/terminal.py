@@ -28,14 +28,17 @@ def print_status(status: int, line: str) -> int:
 
 
 def print_rich(*items: object) -> None:
-    """Print objects with rich."""
+    """Print tables, texts, and what rich can draw."""
     from rich.console import Console
+    from rich.text import Text
+
+    from bench.core.table import Table, to_terminal
 
     console = Console(width=None if sys.stdout.isatty() else PIPED_WIDTH)
     # Rich itself exits with status 1 on a closed pipe, which has another meaning here.
     with console.capture() as captured:
         for item in items:
-            console.print(item)
+            console.print(to_terminal(item) if isinstance(item, Table) else Text(item) if isinstance(item, str) else item)
     encoding = sys.stdout.encoding or "utf-8"
     sys.stdout.write(captured.get().encode(encoding, "backslashreplace").decode(encoding))
 

@@ -33,7 +33,6 @@ def execute_with_progress(plans: Sequence[Plan], out: Path, engine: Engine, titl
 
 def print_tables(records: Sequence[Record]) -> None:
     """Print the tables of records."""
-    from bench.core.table import to_terminal
     from leaderboard.tables import build_tables
 
-    print_rich(*map(to_terminal, build_tables(records, brief=True, foldable=sys.stdout.isatty())))
+    print_rich(*build_tables(records, brief=True, foldable=sys.stdout.isatty()))

@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-import torch
 
 from bench.api import Defense
 from bench.codebook.public import Public
@@ -43,6 +42,8 @@ def prior_odds(defense: Defense, public: Public, size: int) -> float:
 
 def build_graph(releases: Sequence[WordSets], odds: Sequence[float], neighbours: int) -> KeypointGraph:
     """Join releases with equally many candidates per keypoint into one graph, without edges between releases."""
+    import torch
+
     neighbour_indices, offsets, present, positions = [], [], [], []
     start = 0
     for release in releases:

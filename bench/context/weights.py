@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import functools
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 
-from bench.context.network import ContextModel, Shape
-from bench.core.device import pick_device
 from bench.core.errors import UserError
 from bench.formats import tensor_file
+
+if TYPE_CHECKING:
+    from bench.context.network import ContextModel
 
 KIND = "surroundings-network"
 
@@ -22,9 +23,31 @@ KIND = "surroundings-network"
 class Network:
     """A trained network, ready for inference."""
 
-    module: ContextModel
+    path: Path
+    arrays: tensor_file.Arrays
     meta: dict[str, Any]
     digest: str
+
+    @cached_property
+    def module(self) -> ContextModel:
+        """The network itself, built at first use.
+
+        Raises
+        ------
+        UserError
+            if its tensors do not match its metadata.
+        """
+        import torch
+
+        from bench.context.network import ContextModel, Shape
+        from bench.core.device import pick_device
+
+        module = ContextModel(Shape(**self.meta["shape"]))
+        try:
+            module.load_state_dict({name: torch.from_numpy(array.astype(np.float32)) for name, array in self.arrays.items()})
+        except RuntimeError as error:
+            raise UserError(f"{self.path}: tensors do not match the metadata: {error}") from error
+        return module.eval().to(pick_device())
 
 
 def save(path: Path, module: ContextModel, meta: dict[str, Any]) -> str:
@@ -39,7 +62,7 @@ def load(path: Path) -> Network:
     Raises
     ------
     UserError
-        if the file is damaged, or its tensors do not match its metadata.
+        if the file is damaged.
     """
     status = path.stat() if path.is_file() else None
     return _load(path, status and (status.st_mtime_ns, status.st_size))
@@ -47,10 +70,4 @@ def load(path: Path) -> Network:
 
 @functools.lru_cache(maxsize=4)
 def _load(path: Path, version: object) -> Network:
-    arrays, meta, digest = tensor_file.load(path, KIND)
-    module = ContextModel(Shape(**meta["shape"]))
-    try:
-        module.load_state_dict({name: torch.from_numpy(array.astype(np.float32)) for name, array in arrays.items()})
-    except RuntimeError as error:
-        raise UserError(f"{path}: tensors do not match the metadata: {error}") from error
-    return Network(module.eval().to(pick_device()), meta, digest)
+    return Network(path, *tensor_file.load(path, KIND))

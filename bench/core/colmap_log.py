@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-import pycolmap
-
 ERRORS = 2  # level of glog
 
 
 @contextmanager
 def silence_colmap() -> Iterator[None]:
     """Log COLMAP's errors only, inside a `with` statement."""
+    import pycolmap
+
     before = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = ERRORS
     try:

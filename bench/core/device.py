@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-import torch
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import torch
 
 
 def pick_device() -> torch.device:
     """Return CUDA if available, else Apple's MPS, else the CPU."""
+    import torch
+
     if torch.cuda.is_available():
         return torch.device("cuda")
     if torch.backends.mps.is_available():
@@ -16,12 +21,16 @@ def pick_device() -> torch.device:
 
 def pick_double_device() -> torch.device:
     """Return the device for float64: MPS does not support it."""
+    import torch
+
     device = pick_device()
     return torch.device("cpu") if device.type == "mps" else device
 
 
 def pick_dtype(device: torch.device) -> torch.dtype:
     """Return bf16 if the hardware multiplies it faster than float32, else float32."""
+    import torch
+
     if device.type == "cuda":
         return torch.bfloat16 if torch.cuda.is_bf16_supported() else torch.float32
     if device.type == "cpu":

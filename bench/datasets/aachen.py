@@ -5,8 +5,8 @@
                                                 v1.1: aachen_v_1_1/, a COLMAP model, or an NVM with database_intrinsics_v1_1.txt
     queries/{day,night}_time_queries_with_intrinsics*.txt
 
-The poses of its queries are withheld. A file ground_truth.txt, which the download does not have, is read if it exists: the gallery
-is exported in this layout too.
+The poses of its queries are withheld. A file ground_truth.txt, which the download does not have, is read if it exists: the
+gallery is exported in this layout too.
 """
 
 from __future__ import annotations
@@ -15,9 +15,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
-
-import pycolmap
+from typing import TYPE_CHECKING, Literal, get_args
 
 from bench.api import Dataset
 from bench.core.errors import UserError
@@ -25,6 +23,9 @@ from bench.datasets import colmap
 from bench.datasets.colmap import PosedImage
 from bench.formats import lists, nvm
 from bench.images.scene import Condition, Scene
+
+if TYPE_CHECKING:
+    import pycolmap
 
 Version = Literal["v1", "v1.1"]
 
@@ -146,7 +147,8 @@ def _find_query_list(root: Path, condition: Condition, version: Version | None) 
     if not candidates:
         raise UserError(f"{folder / pattern}: no such file")
     if len(candidates) > 1 and version is None:
-        raise UserError(f"{folder}: {' and '.join(path.name for path in there)} are both there; say which version, v1 or v1.1")
+        names = " and ".join(path.name for path in candidates)
+        raise UserError(f"{folder}: holds both {names}; give version=v1 or version=v1.1")
     if len(candidates) > 1:
         candidates = [path for path in candidates if bool(VERSION_1_1.search(path.name)) == (version == "v1.1")]
     if len(candidates) != 1:

@@ -10,9 +10,9 @@ from __future__ import annotations
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pycolmap
 
 from bench.api import Dataset
 from bench.cache import provenance, store
@@ -22,6 +22,9 @@ from bench.datasets import colmap
 from bench.datasets.colmap import PosedImage
 from bench.images.photographs import Source, list_photographs
 from bench.images.scene import File, Reference, Scene
+
+if TYPE_CHECKING:
+    import pycolmap
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,10 +47,14 @@ class Captured(Dataset):
             raise UserError("captured: length must be finite and above zero")
 
     def scene(self) -> Scene:
+        import pycolmap
+
         sources = list_photographs(self.path)
         queries = sources[: self.leading] if self.leading else sources[:: self.held_out]
         if len(queries) == len(sources):
-            raise UserError(f"{self.path}: all {len(sources)} photographs would be queries, and none a reference; lower leading")
+            raise UserError(
+                f"{self.path}: all {len(sources)} photographs would be queries, and none a reference; lower leading or add some"
+            )
         posed = colmap.read_model(_load_model(self.path, sources))
         first, second = self.first or sources[0].name, self.second or sources[len(sources) // 2].name
         scale = self.length / _measure_distance(posed, first, second)
@@ -67,6 +74,7 @@ class Captured(Dataset):
 
 def _load_model(directory: Path, sources: list[Source]) -> Path:
     """Return the folder with the cached model of these photographs; build it if it is missing."""
+    import pycolmap
 
     def build(path: Path) -> None:
         with tempfile.TemporaryDirectory() as scratch, silence_colmap():
@@ -76,12 +84,14 @@ def _load_model(directory: Path, sources: list[Source]) -> Path:
     return store.fetch_folder(
         "models",
         {"pycolmap": pycolmap.__version__, "photographs": photographs, "source": provenance.hash_modules(__name__)},
-        make,
+        build,
     )
 
 
 def _run_structure_from_motion(directory: Path, names: list[str], scratch: Path) -> pycolmap.Reconstruction:
     """Run COLMAP's own pipeline with its default SIFT and one camera for all; return the largest model."""
+    import pycolmap
+
     database = scratch / "database.db"
     pycolmap.extract_features(database, directory, image_names=names, camera_mode=pycolmap.CameraMode.SINGLE)
     pycolmap.match_exhaustive(database)

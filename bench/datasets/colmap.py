@@ -15,15 +15,17 @@ from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
-from typing import get_args
+from typing import TYPE_CHECKING, get_args
 
 import numpy as np
-import pycolmap
 
 from bench.api import Dataset
 from bench.core.errors import UserError
 from bench.formats import lists
 from bench.images.scene import Condition, File, Reference, Scene, SceneImage
+
+if TYPE_CHECKING:
+    import pycolmap
 
 PARTS = ("cameras", "images", "points3D")
 
@@ -70,7 +72,7 @@ def find_ground_truth(root: Path) -> Path | None:
     return next((path for path in (root / "ground_truth.txt", root / "ground_truth") if path.exists()), None)
 
 
-PosedImage = tuple[str, pycolmap.Camera, pycolmap.Rigid3d]  # file and line, for messages; intrinsics; camera from world
+PosedImage = tuple[str, "pycolmap.Camera", "pycolmap.Rigid3d"]  # file and line, for messages; intrinsics; camera from world
 
 
 def assemble(
@@ -118,6 +120,8 @@ def read_model(folder: Path) -> dict[str, PosedImage]:
     UserError
         naming file and, for text, line, if the model is damaged or holds no pose.
     """
+    import pycolmap
+
     wheres = _check_text(folder) if (folder / "images.txt").is_file() else {}
     try:
         model = pycolmap.Reconstruction(folder)

@@ -12,10 +12,9 @@ from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-import pycolmap
 
 import bench.rendering
 from bench.api import Dataset
@@ -26,9 +25,12 @@ from bench.rendering.building import Building, build
 from bench.rendering.cutouts import Person
 from bench.rendering.raster import PinholeCamera, draw
 from bench.rendering.rooms import ROOMS
-from bench.rendering.sensor import Sensor, expose, compute_gain
+from bench.rendering.sensor import Sensor, compute_gain, expose
 from bench.rendering.walks import Station
 from bench.types import Bytes, Floats
+
+if TYPE_CHECKING:
+    import pycolmap
 
 FIELD_OF_VIEW = np.radians(63.0)  # of the references, from left to right
 QUERY_ZOOMS = (0.92, 1.0, 1.15)  # focal lengths of the queries' phones, relative to the references'
@@ -113,7 +115,7 @@ def render(gallery: Gallery, kind: Kind, index: int) -> Shot:
     people = crowd.gather_people(
         np.random.default_rng([*key, 0]), _create_people(gallery.seed)[kind], gallery.people, camera, building, night
     )
-    drawing = draw(camera, building.night if night else building.day, present, lambda rays: building.compute_sky(rays, night))
+    drawing = draw(camera, building.night if night else building.day, people, lambda rays: building.compute_sky(rays, night))
     sensor = _choose_sensor(gallery, kind, night)
     pixels = expose(drawing.light, sensor, compute_gain(drawing.light), np.random.default_rng([*key, 1]))
     return Shot(pixels=pixels, foreground=drawing.foreground, depth=drawing.depth)
@@ -184,6 +186,8 @@ def _load_building(seed: int, repeats: float, bare: float, detail: float) -> Bui
 
 
 def _create_camera(gallery: Gallery, zoom: float) -> pycolmap.Camera:
+    import pycolmap
+
     focal = zoom * gallery.width / 2 / np.tan(FIELD_OF_VIEW / 2)
     return pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", round(float(focal), 3), gallery.width, gallery.height)
 
@@ -211,6 +215,8 @@ def _create_query(model: _Model, index: int) -> SceneImage:
 
 
 def _compute_pose(view: _View) -> pycolmap.Rigid3d:
+    import pycolmap
+
     rotation = view.station.rotation
     return pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ view.station.centre)
 

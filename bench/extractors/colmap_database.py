@@ -1,7 +1,7 @@
 """Features that COLMAP extracted, read from its database through pycolmap.
 
-COLMAP's centre of the first pixel is (0.5, 0.5), as ours. Descriptors are its 8-bit ones. An image's name in the database is its
-path below COLMAP's image folder.
+COLMAP puts the centre of the first pixel at (0.5, 0.5), as we do. Descriptors are its 8-bit ones. An image's name in the database
+is its path below COLMAP's image folder.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class ColmapDatabase(Extractor):
         import pycolmap
 
         if source is None:
-            raise UserError("colmap-database: features are found by the photograph's file, and this one has none")
+            raise UserError("colmap-database: features are looked up by the photograph's file, and this one has none")
         numbers = _list_images(self.path, self.path.stat().st_mtime_ns)
         name = match_name(source, numbers)
         if name is None:
@@ -56,14 +56,14 @@ class ColmapDatabase(Extractor):
         keep = ((xy >= 0) & (xy < side)).all(axis=1) & codes.any(axis=1)
         if not keep.any():
             raise SampleError(f"{source.name}: no keypoint of {self.path} lies in the photograph's central square")
-        kept = np.ascontiguousarray(codes[keep])
-        found = Features(keypoints=xy[keep].astype(np.float32), descriptors=unit_rows(kept), codes=kept, size=(side, side))
-        return found.by_position()
+        rows = np.ascontiguousarray(codes[keep])
+        features = Features(keypoints=xy[keep].astype(np.float32), descriptors=unit_rows(rows), codes=rows, size=(side, side))
+        return features.by_position()
 
 
 @lru_cache(maxsize=4)
 def _list_images(path: Path, changed: int) -> dict[str, tuple[int, tuple[int, int]]]:
-    """Name -> number, and width and height, of each image of a database as it was at that time."""
+    """List the images of a database. -> by name: number, (width, height); `changed`, the file's time, is part of the cache key"""
     import pycolmap
 
     with pycolmap.Database.open(path) as database:

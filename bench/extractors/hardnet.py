@@ -1,7 +1,7 @@
 """HardNet descriptors (Mishchuk et al., NeurIPS 2017) of upright SIFT keypoints, through kornia (`pip install kornia`).
 
-Nothing is downloaded. The weights are kornia's `checkpoint_liberty_with_aug.pth`: a file that is named, or where torch.hub
-keeps it (`torch.hub.get_dir()`/checkpoints) after `kornia.feature.HardNet(pretrained=True)` was called once.
+Nothing is downloaded. The weights are kornia's `checkpoint_liberty_with_aug.pth`: a given file, or the copy that torch.hub stores
+(`torch.hub.get_dir()`/checkpoints) on the first call of `kornia.feature.HardNet(pretrained=True)`.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from bench.types import Features, Floats
 HUB = Path("hub")
 WEIGHTS = "checkpoint_liberty_with_aug.pth"
 RADIUS = 3.0  # of a patch, in diameters of a keypoint: six standard deviations, as of SIFT's own window and in kornia
-BATCH = 256  # patches at a time
+BATCH = 256  # patches
 
 
 @dataclass(frozen=True, kw_only=True)
 class HardNet(Extractor):
     """HardNet at upright SIFT's keypoints."""
 
-    weights: Path  # kornia's file, or `hub` for where torch.hub keeps it; records hold the content's digest
+    weights: Path  # kornia's file, or `hub` for torch.hub's copy; records hold the content's digest
     max_keypoints: int = 1000  # those of strongest response
 
     def __post_init__(self) -> None:
@@ -42,27 +42,27 @@ class HardNet(Extractor):
             raise UserError(f"hardnet: max_keypoints must be at least 1, got {self.max_keypoints}")
 
     def extract(self, image: np.ndarray, source: Path | None = None) -> Features:
-        found = Sift(max_keypoints=self.max_keypoints).extract(image, source)
-        assert found.frames is not None
-        rows = _describe(image, found.keypoints, found.frames[:, 0], self.weights)
+        sift_features = Sift(max_keypoints=self.max_keypoints).extract(image, source)
+        assert sift_features.frames is not None
+        rows = _describe(image, sift_features.keypoints, sift_features.frames[:, 0], self.weights)
         keep = np.asarray(rows.any(axis=1))
-        return dataclasses.replace(found, descriptors=unit_rows(rows), codes=None).take(keep)
+        return dataclasses.replace(sift_features, descriptors=unit_rows(rows), codes=None).take(keep)
 
 
 def _find_weights() -> Path:
     import torch
 
     folder = Path(torch.hub.get_dir()) / "checkpoints"
-    kept = sorted(folder.glob(f"*{WEIGHTS}"))  # kornia puts the name of its repository before
-    if not kept:
+    candidates = sorted(folder.glob(f"*{WEIGHTS}"))  # kornia prepends the name of its repository
+    if not candidates:
         raise UserError(
             f"hardnet: no {WEIGHTS} in {folder}; call kornia.feature.HardNet(pretrained=True) once, or give weights=FILE"
         )
-    return kept[0]
+    return candidates[0]
 
 
 def _describe(image: np.ndarray, keypoints: Floats, diameters: Floats, path: Path) -> Floats:
-    """(H, W, 3), (N, 2), (N,) -> (N, 128)"""
+    """Compute descriptors. (H, W, 3), (N, 2), (N,) -> (N, 128)"""
     import torch
 
     kornia, network = _load_network(path, path.stat().st_mtime_ns)
@@ -77,7 +77,7 @@ def _describe(image: np.ndarray, keypoints: Floats, diameters: Floats, path: Pat
 
 @lru_cache(maxsize=2)
 def _load_network(path: Path, changed: int) -> tuple[Any, Any]:
-    """kornia, and its network with the weights of a file as it was at that time."""
+    """Return kornia, and its network with the weights of the file; `changed`, the file's time, is part of the cache key."""
     import torch
 
     try:
@@ -87,7 +87,7 @@ def _load_network(path: Path, changed: int) -> tuple[Any, Any]:
     network = kornia.feature.HardNet(pretrained=False)
     try:
         network.load_state_dict(torch.load(path, map_location="cpu", weights_only=True)["state_dict"])
-    except Exception as error:  # whatever torch raises of a file that is something else
+    except Exception as error:  # torch raises various errors for files of other formats
         raise UserError(f"hardnet: {path}: not kornia's {WEIGHTS} ({type(error).__name__})") from None
     return kornia, network.eval()
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import h5py
 import numpy as np
 
 from bench.api import Extractor
@@ -30,6 +29,8 @@ class Hloc(Extractor):
     eight_bit: bool = False  # whether each is an 8-bit integer vector, scaled
 
     def __post_init__(self) -> None:
+        import h5py
+
         if not self.path.is_file():
             raise UserError(f"hloc: {self.path}: no such file")
         if not h5py.is_hdf5(self.path):
@@ -37,7 +38,7 @@ class Hloc(Extractor):
 
     def extract(self, image: np.ndarray, source: Path | None = None) -> Features:
         if source is None:
-            raise UserError("hloc: features are found by the photograph's file, and this one has none")
+            raise UserError("hloc: features are looked up by the photograph's file, and this one has none")
         keypoints, stored, size = self._read(source)
         _check(source, stored, len(keypoints), self.dimension, size)
         descriptors = stored.T  # (N, D)
@@ -48,11 +49,13 @@ class Hloc(Extractor):
             raise SampleError(f"{source.name}: no keypoint of {self.path} lies in the photograph's central square")
         codes = np.ascontiguousarray(descriptors[keep]) if descriptors.dtype == np.uint8 else None
         rows = unit_rows(descriptors[keep].astype(np.float32))
-        found = Features(keypoints=xy[keep].astype(np.float32), descriptors=rows, codes=codes, size=(side, side))
-        return found.by_position()
+        features = Features(keypoints=xy[keep].astype(np.float32), descriptors=rows, codes=codes, size=(side, side))
+        return features.by_position()
 
     def _read(self, source: Path) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
-        """-> keypoints (N, 2), descriptors (D, N), and the width and height that they were extracted at"""
+        """Read the group. -> keypoints (N, 2), descriptors (D, N), and the (width, height) of the image"""
+        import h5py
+
         with h5py.File(self.path) as opened:
             name = match_name(source, opened)
             group = None if name is None else opened[name]

@@ -1,4 +1,4 @@
-"""SIFT through OpenCV, upright unless told otherwise (Lowe, IJCV 2004)."""
+"""SIFT through OpenCV, upright by default (Lowe, IJCV 2004)."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from bench.types import Features, Indices
 class Sift(Extractor):
     """SIFT; upright by default: one orientation, gravity's, and each point once.
 
-    Orientation is never released. An upright descriptor tells the attacker where its edges point; an oriented one
-    (`upright=false`, the paper's) leaves that to be inferred.
+    Orientation is never released. An upright descriptor reveals the direction of its edges. For an oriented one
+    (`upright=false`, the paper's) the attacker must infer it.
     """
 
     exact_zeros = True
     eight_bit = True
 
     upright: bool = True
-    contrast_threshold: float = 0.002  # lower than OpenCV's .04: 256 x 256 pixels shall give about 600 to 1,000 keypoints
+    contrast_threshold: float = 0.002  # lower than OpenCV's .04: about 600 to 1,000 keypoints for 256 x 256 pixels
     edge_threshold: float = 15.0
     max_keypoints: int = 1000  # those of strongest response
 
@@ -50,18 +50,18 @@ class Sift(Extractor):
         if not points:
             raise SampleError("no keypoint was found: is the image flat?")
         points, values = sift.compute(grey, points)
-        codes = values.astype(np.uint8)  # OpenCV rounds to 0..255 and hands them out as float32
+        codes = values.astype(np.uint8)  # OpenCV rounds to 0..255 and returns float32
         xy = np.array([point.pt for point in points], dtype=np.float32) + 0.5  # OpenCV's centre of the first pixel is 0
         frames = np.array([(point.size, math.radians(point.angle)) for point in points], dtype=np.float32)  # (N, 2)
         keep = codes.any(axis=1)
         height, width = grey.shape
-        found = Features(
+        features = Features(
             keypoints=xy[keep], descriptors=unit_rows(codes[keep]), codes=codes[keep], size=(width, height), frames=frames[keep]
         )
-        return found.by_position()
+        return features.by_position()
 
     def mirror_order(self) -> Indices:
-        """Upright: columns of the 4 x 4 histograms change places, and angle a becomes π - a. Oriented: rows, and -a."""
+        """Upright: the columns of the 4 x 4 histograms are reversed, and angle a becomes π - a. Oriented: rows, and -a."""
         row, column, angle = np.indices((4, 4, 8))
         if self.upright:
             column, angle = 3 - column, (4 - angle) % 8
@@ -71,7 +71,7 @@ class Sift(Extractor):
         return order
 
     def turn_order(self) -> Indices:
-        """Upright: columns of the histograms become rows from below, and angle a becomes a + π / 2. Oriented: as it was."""
+        """Upright: columns of the histograms become rows from below, and angle a becomes a + π / 2. Oriented: unchanged."""
         row, column, angle = np.indices((4, 4, 8))
         if self.upright:
             row, column, angle = column, 3 - row, (angle - 2) % 8
@@ -83,7 +83,7 @@ class Sift(Extractor):
 
 
 def _deduplicate(points: list) -> list:
-    """Drop the repetitions of a point that differ in orientation only, and fix the orientation."""
+    """Drop points that differ in orientation only, and set the orientation to 0."""
     unique = {(point.pt, point.size): point for point in points}
     for point in unique.values():
         point.angle = 0.0

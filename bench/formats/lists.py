@@ -8,15 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
-import pycolmap
 
 from bench.core.errors import UserError, unknown_name
 
+if TYPE_CHECKING:
+    import pycolmap
+
 ROUNDING = 1e-3  # tolerated difference of the norm of a quaternion in a file from 1
-MODELS = sorted(set(pycolmap.CameraModelId.__members__) - {"INVALID"})
 
 T = TypeVar("T")
 
@@ -89,11 +90,14 @@ def read_lines(path: Path) -> Iterator[tuple[int, str]]:
 
 def parse_camera(fields: Sequence[str], where: str) -> pycolmap.Camera:
     """Parse MODEL width height params. `where` begins the message of the UserError for malformed fields."""
+    import pycolmap
+
     if len(fields) < 3:
         raise UserError(f"{where}: expected MODEL width height params, not {' '.join(fields)!r}")
     model, width, height = fields[:3]
-    if model not in MODELS:
-        raise UserError(f"{where}: {unknown_name('parse_camera model', model, MODELS)}")
+    models = set(pycolmap.CameraModelId.__members__) - {"INVALID"}
+    if model not in models:
+        raise UserError(f"{where}: {unknown_name('camera model', model, models)}")
     if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
         raise UserError(f"{where}: width and height must be whole numbers above zero, not {width} {height}")
     parsed = pycolmap.Camera.create_from_model_name(1, model, 1.0, int(width), int(height))
@@ -110,6 +114,8 @@ def parse_camera(fields: Sequence[str], where: str) -> pycolmap.Camera:
 
 def parse_pose(fields: Sequence[str], where: str) -> pycolmap.Rigid3d:
     """Parse qw qx qy qz tx ty tz. `where` begins the message of the UserError for malformed fields."""
+    import pycolmap
+
     if len(fields) != 7:
         raise UserError(f"{where}: expected qw qx qy qz tx ty tz, but there are {len(fields)} fields")
     values = parse_numbers(fields, where)
@@ -118,6 +124,8 @@ def parse_pose(fields: Sequence[str], where: str) -> pycolmap.Rigid3d:
 
 def parse_rotation(wxyz: np.ndarray, where: str) -> pycolmap.Rotation3d:
     """Return the rotation of a unit quaternion (4,) w x y z; raise UserError if its norm is not 1."""
+    import pycolmap
+
     norm = float(np.linalg.norm(wxyz))
     if abs(norm - 1) > ROUNDING:
         raise UserError(f"{where}: the quaternion {_format_numbers(wxyz)} has norm {norm:.6g}, not 1")

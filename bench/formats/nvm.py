@@ -9,11 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-
-import pycolmap
+from typing import TYPE_CHECKING
 
 from bench.core.errors import UserError
 from bench.formats import lists
+
+if TYPE_CHECKING:
+    import pycolmap
 
 
 def read(path: Path) -> dict[str, tuple[int, pycolmap.Rigid3d]]:
@@ -24,6 +26,8 @@ def read(path: Path) -> dict[str, tuple[int, pycolmap.Rigid3d]]:
     UserError
         if the file or one of its cameras is malformed.
     """
+    import pycolmap
+
     rows = lists.read_fields(path)
     number, header = next(rows, (1, []))
     if not header or header[0] != "NVM_V3":

@@ -7,16 +7,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import get_args
+from typing import TYPE_CHECKING, get_args
 
 import numpy as np
-import pycolmap
 from PIL import Image
 
 from bench.core.errors import UserError
 from bench.core.progress import Progress
 from bench.formats import lists, nvm
 from bench.images.scene import Condition, Reference, Scene
+
+if TYPE_CHECKING:
+    import pycolmap
 
 
 def write(scene: Scene, layout: str, out: Path) -> None:
@@ -73,6 +75,8 @@ def build_model(images: tuple[Reference, ...]) -> pycolmap.Reconstruction:
 
     Images are numbered from 1 in the given order.
     """
+    import pycolmap
+
     reconstruction = pycolmap.Reconstruction()
     numbers: dict[tuple[object, ...], int] = {}
     for number, image in enumerate(images, 1):

@@ -5,14 +5,17 @@ In float32. The error is about 1e-6 for points of unit norm and subspaces, and a
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
-import torch
-from torch import Tensor
 
 from bench.core.device import pick_device
 from bench.geometry.intersections import squared_distances
 from bench.geometry.subspaces import feet_and_frames
 from bench.types import Indices, Subspaces
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 def points_to_points(one: Tensor, other: Tensor) -> Tensor:
@@ -25,6 +28,8 @@ def subspaces_to_points(release: Subspaces, points: Tensor) -> Tensor:
 
     1 + |p|² − 2 p·u − |B u|², where p is the subspace's point nearest to zero.
     """
+    import torch
+
     feet, frames = feet_and_frames(release)
     planes = torch.from_numpy(np.concatenate([feet[:, None], frames], axis=1).transpose(1, 0, 2).astype(np.float32, order="C"))
     foot, *axes = planes.to(points.device)  # (N, D) each
@@ -36,6 +41,8 @@ def subspaces_to_points(release: Subspaces, points: Tensor) -> Tensor:
 
 def subspaces_to_subspaces(one: Subspaces, other: Subspaces) -> Tensor:
     """Squared distances of subspaces. -> (N, N')"""
+    import torch
+
     squared = torch.empty(len(one), len(other), device=pick_device())
     for top, left, block in squared_distances(one, other, directions=one.origins.shape[1]):
         squared[top : top + block.shape[0], left : left + block.shape[1]] = block
@@ -54,6 +61,8 @@ def find_mutual_nearest(squared: Tensor, ratio: float = 1.0) -> tuple[Indices, I
     -------
     (M,) rows, ascending, and their columns.
     """
+    import torch
+
     if squared.numel() == 0:
         return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
     columns = squared.argmin(dim=1)  # (N,)

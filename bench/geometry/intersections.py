@@ -16,16 +16,17 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from bench.core.device import pick_device
 from bench.core.errors import UserError
 from bench.types import Indices, Subspaces
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 Doubles = NDArray[np.float64]
 
@@ -112,6 +113,8 @@ def squared_distances(
 
 def _project_subspaces(release: Subspaces, count: int) -> Tensor:
     """Project each subspace onto `count` directions: orthonormal basis and point nearest to zero. -> (dim + 1, N, count)"""
+    import torch
+
     onto = _draw_directions(release.origins.shape[1], count)  # (D, count)
     span = np.linalg.qr((release.bases.astype(np.float64) @ onto).transpose(0, 2, 1))[0]  # (N, count, dim)
     points = (release.origins.astype(np.float64) @ onto)[:, :, None]  # (N, count, 1)
@@ -130,6 +133,8 @@ def _compute_squared_distances(one: Tensor, other: Tensor) -> Tensor:
 
     Symmetric elimination. Entries above the diagonal of the form are never read.
     """
+    import torch
+
     a, b = len(one) - 1, len(other) - 1
     flat = one.flatten(0, 1) @ other.flatten(0, 1).T
     products = flat.view(a + 1, one.shape[1], b + 1, other.shape[1]).transpose(1, 2).contiguous()  # (a + 1, b + 1, n, n')

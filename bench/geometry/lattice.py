@@ -15,7 +15,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from flint import fmpz_mat
 from numpy.typing import NDArray
 
 from bench.geometry.nearest_words import unit_rows
@@ -119,6 +118,8 @@ def enumerate_short_vectors(grams: Doubles, bounds: Doubles) -> tuple[Indices, I
 
 def reduce_basis(basis: Doubles) -> Doubles:
     """LLL-reduce the rows of a basis, rounded to multiples of 1 / FINENESS. (n, c) -> (n, c)"""
+    from flint import fmpz_mat
+
     rows, columns = basis.shape
     short = fmpz_mat(rows, columns, np.rint(FINENESS * basis).astype(np.int64).ravel().tolist()).lll()
     return np.array([float(entry) for entry in short.entries()]).reshape(basis.shape) / FINENESS

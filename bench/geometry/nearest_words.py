@@ -6,13 +6,16 @@ Floor: 2·N·K·D operations at the machine's bf16 matrix rate; the words are re
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from bench.core.device import pick_device, pick_dtype
 from bench.types import Bytes, Floats, Indices
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
 
 BLOCK = 2048  # words in a block: a block and its scores stay in the cache
 BATCH = 512  # queries per pass over the words
@@ -31,6 +34,8 @@ class WordIndex:
     """A search index of (K, D) uint8 words, none zero."""
 
     def __init__(self, words: Bytes) -> None:
+        import torch
+
         device = pick_device()
         self._dtype = pick_dtype(device)
         self._words = words
@@ -50,6 +55,8 @@ class WordIndex:
         -------
         (N,) int64. Cosines are compared as dot² / |word|² in float64; uint8 rows have exact dot products in it.
         """
+        import torch
+
         found = np.empty(len(queries), dtype=np.int64)
         for start in range(0, len(queries), BATCH):
             batch = queries[start : start + BATCH]
@@ -63,6 +70,8 @@ class WordIndex:
 
     def _find_candidates(self, queries: Tensor, errors: Tensor) -> tuple[np.ndarray, np.ndarray]:
         """Find the pairs of a query and a word that may be its nearest. (n, D), (n,) rounding errors -> (P,), (P,)"""
+        import torch
+
         blocks = self._coarse.split(BLOCK)
         tops = torch.stack([block_maxima(queries, block) for block in blocks], dim=1).float()  # (n, blocks)
         best = tops.amax(dim=1)
@@ -98,6 +107,8 @@ def margin(best: Tensor, errors: Tensor, dtype: torch.dtype) -> Tensor:
     By Cauchy-Schwarz a cosine is off by at most the sum of the distances that its unit rows were moved, and then by half a unit
     in the last place as it is rounded itself: a quarter of the type's `eps` below one, half of it above. Two are compared.
     """
+    import torch
+
     eps = torch.finfo(dtype).eps
     return 2 * (errors + torch.where(best < 1, eps / 4, eps / 2) + SLACK)
 

@@ -6,13 +6,16 @@ two words alone: not on the other words of a query, the number of threads or the
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from bench.core.device import pick_device
 from bench.types import Bytes, Indices
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 Doubles = NDArray[np.float64]
 
@@ -25,6 +28,8 @@ class Neighbours:
     """A comparison index of (K, D) uint8 words, none zero."""
 
     def __init__(self, words: Bytes) -> None:
+        import torch
+
         exact = torch.from_numpy(words.astype(np.float32))
         self._words = exact.to(pick_device())  # (K, D)
         self._lengths = exact.double().square().sum(dim=1).sqrt().to(pick_device())  # (K,)
@@ -44,6 +49,8 @@ class Neighbours:
         return table[words]
 
     def _find(self, words: Indices, count: int) -> Indices:
+        import torch
+
         rows = torch.from_numpy(words)
         blocks = (self._compute_cosines_own_first(rows, at) for at in self._starts())
         tops = torch.cat([block.topk(min(count, block.shape[1]), dim=1).values for block in blocks], dim=1)
@@ -98,6 +105,8 @@ class Neighbours:
         return table[words].astype(np.int64)
 
     def _find_levels(self, words: Indices, borders: Doubles) -> Indices:
+        import torch
+
         found = np.empty((len(words), len(self._starts()), len(borders) + 1), dtype=np.int64)
         for start in range(0, len(words), BATCH):
             rows = torch.from_numpy(words[start : start + BATCH])
@@ -119,6 +128,8 @@ class Neighbours:
         -------
         (n,) words
         """
+        import torch
+
         before = np.take_along_axis(counts, levels[:, None, None], axis=2)[..., 0].cumsum(axis=1)  # (n, blocks)
         blocks = (before <= ranks[:, None]).sum(axis=1)
         rest = ranks - np.where(blocks > 0, np.take_along_axis(before, np.maximum(blocks - 1, 0)[:, None], axis=1)[:, 0], 0)
@@ -132,6 +143,8 @@ class Neighbours:
 
     def _compute_levels(self, rows: Tensor, start: int, borders: Doubles) -> Tensor:
         """Compute the number of borders that each word of a block reaches. -> (n, b)"""
+        import torch
+
         return torch.bucketize(
             self._compute_cosines(rows, start), torch.from_numpy(borders).to(self._words.device), right=True
         ).cpu()
@@ -139,5 +152,7 @@ class Neighbours:
 
 def _count_per_row(levels: Tensor, count: int) -> Indices:
     """Count each level in each row. (n, b) -> (n, count)"""
+    import torch
+
     offsets = torch.arange(len(levels))[:, None] * count
     return (levels + offsets).ravel().bincount(minlength=len(levels) * count).view(-1, count).numpy()

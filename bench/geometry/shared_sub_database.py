@@ -20,7 +20,7 @@ from bench.geometry.intersections import (
     find_intersections,
     find_intersections_within,
 )
-from bench.types import Points, Subspaces
+from bench.types import Points, Release, Subspaces
 
 BATCH = 16  # releases per batch
 SAMPLE_INTERSECTIONS = 8.0  # expected number with the sample of a sharing release: one in 3,000 has none
@@ -42,7 +42,7 @@ class SharedSubDatabase:
         return f"coverage {self.coverage:.3f}: {self.sharing} of {self.searched} other releases share the sub-database"
 
 
-def find_shared_sub_database(target: Subspaces, others: Iterator[Subspaces], words: int, enough: float) -> SharedSubDatabase:
+def find_shared_sub_database(target: Subspaces, others: Iterator[Release], words: int, enough: float) -> SharedSubDatabase:
     """Search other releases until the intersections cover a fraction `enough` of the words in the target's subspaces.
 
     Parameters
@@ -50,13 +50,18 @@ def find_shared_sub_database(target: Subspaces, others: Iterator[Subspaces], wor
     others : releases of the same defense
     words : per subspace
     enough : from 0 to 1
+
+    Raises
+    ------
+    TypeError
+        if another release holds no subspaces.
     """
     own = find_intersections_within(target)
     intersections = [own, replace(own, first=own.second, second=own.first)]
     parts, searched, size = [target], 0, len(target)
     pairs, found = len(target) * (len(target) - 1) // 2, len(own)
     while (coverage := _compute_coverage(concatenate_intersections(intersections), words * len(target))) < enough:
-        batch = list(itertools.islice(others, BATCH))
+        batch = [_require_subspaces(release) for release in itertools.islice(others, BATCH)]
         if not batch:
             break
         searched += len(batch)
@@ -67,6 +72,12 @@ def find_shared_sub_database(target: Subspaces, others: Iterator[Subspaces], wor
             size += len(part)
             pairs, found = pairs + len(target) * len(part), found + len(more)
     return SharedSubDatabase(stack_subspaces(parts), concatenate_intersections(intersections), searched, len(parts) - 1, coverage)
+
+
+def _require_subspaces(release: Release) -> Subspaces:
+    if not isinstance(release, Subspaces):
+        raise TypeError(f"expected Subspaces, got {type(release).__name__}")
+    return release
 
 
 def stack_subspaces(releases: Sequence[Subspaces]) -> Subspaces:

@@ -10,14 +10,18 @@ true score. Every other word is a candidate. Zero is no special case; float64 se
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from bench.core.device import pick_device, pick_dtype
 from bench.geometry.nearest_words import unit_rows
 from bench.types import Bytes, Floats, Indices, Subspaces
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
 
 Doubles = NDArray[np.float64]
 
@@ -79,6 +83,8 @@ def project(release: Subspaces, points: Doubles) -> Doubles:
 
 def _find_candidates(feet: Doubles, frames: Doubles, words: Bytes | Floats, count: int) -> tuple[Indices, Indices]:
     """Find pairs of a subspace and a word that may be near it, by subspace. (n, D), (n, dim, D), (K, D) -> (P,) twice"""
+    import torch
+
     device = pick_device()
     dtype = pick_dtype(device)
     exact = np.concatenate([feet[:, None], frames], axis=1).transpose(1, 0, 2)  # (1 + dim, n, D)
@@ -118,6 +124,8 @@ def _select_at_least(least: Tensor, start: int, groups: Tensor, maxima: Tensor) 
 
 def _compute_scores(planes: Tensor, block: Tensor) -> Tensor:
     """Approximate 2 p·u + |B u|². (1 + dim, n, D), (K', D) -> (n, K') float32"""
+    import torch
+
     scale = block.float().square().sum(dim=1).rsqrt()  # (K',) words are multiplied unscaled: bytes are exact in bf16
     products = (planes.flatten(0, 1) @ block.to(planes.dtype).T).unflatten(0, planes.shape[:2])  # (1 + dim, n, K')
     scores = torch.zeros(products.shape[1:], device=planes.device)
@@ -144,6 +152,8 @@ def _bound_error(exact: Doubles, rounded: Doubles, dtype: torch.dtype, words: np
 
         2 (1 + r) (t + y) + 2 r (|p·u| + |B u|²) + (y + r)²,    where |p·u| + |B u|² ≤ 1 + |p|² / 4, as |p̂·u|² + |B u|² ≤ 1.
     """
+    import torch
+
     r = torch.finfo(dtype).eps / 2
     word = 0.0 if words == np.uint8 else r  # |u' − u|
     s = exact.shape[2] * 2.0**-23

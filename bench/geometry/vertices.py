@@ -13,14 +13,16 @@ Wakin, Boyd 2008), and after ROUNDS of those they are drawn again.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from bench.core.device import pick_double_device
 from bench.geometry.pivoting import select_independent_rows
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 Doubles = NDArray[np.float64]
 
@@ -64,6 +66,8 @@ def _walk(
     origins: Doubles, bases: Doubles, pivots: int, enough: Callable[[Tensor], Tensor], rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], Doubles]:
     """`unit_vertices` of one block."""
+    import torch
+
     count, dim, length = bases.shape
     device = pick_double_device()
     o, b = torch.from_numpy(origins).to(device), torch.from_numpy(bases).to(device)
@@ -107,6 +111,8 @@ def _certify(x: Tensor, varying: Tensor, dim: int) -> Tensor:
 
 def _build_tableau(o: Tensor, b: Tensor, frame: Tensor) -> Tensor:
     """Build the tableau of each frame. (n, D), (n, dim, D), (n, dim) -> (n, D, 1 + dim)"""
+    import torch
+
     at_frame = b.gather(2, frame[:, None].expand(-1, b.shape[1], -1))  # (n, dim, dim)
     edges = torch.linalg.solve_ex(at_frame, b)[0].mT  # (n, D, dim)
     x = o - (edges @ o.gather(1, frame)[:, :, None])[:, :, 0]
@@ -115,6 +121,8 @@ def _build_tableau(o: Tensor, b: Tensor, frame: Tensor) -> Tensor:
 
 def _select_edge(tableau: Tensor, frame: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Select the edge of steepest descent: its index, direction and slope. -> (n,) index, (n,) ±1, (n,)"""
+    import torch
+
     x = tableau[:, :, 0]
     gain = torch.where(x >= -ZERO, weights, -PENALTY * weights).scatter(1, frame, 0.0)  # (n, D) without the frame
     slopes = torch.bmm(gain[:, None], tableau[:, :, 1:])[:, 0]  # (n, dim)
@@ -127,6 +135,8 @@ def _select_edge(tableau: Tensor, frame: Tensor, weights: Tensor) -> tuple[Tenso
 
 def _select_component(tableau: Tensor, frame: Tensor, weights: Tensor, edge: Tensor, sign: Tensor, slope: Tensor) -> Tensor:
     """Select the component that vanishes at the least objective along an edge. -> (n,)"""
+    import torch
+
     x = tableau[:, :, 0]
     direction = tableau.gather(2, (edge + 1)[:, None, None].expand(-1, x.shape[1], 1))[:, :, 0] * sign[:, None]  # (n, D)
     meets = ((x > ZERO) & (direction < -FLAT)) | ((x < -ZERO) & (direction > FLAT)) | ((x.abs() <= ZERO) & (direction < -FLAT))
@@ -141,6 +151,8 @@ def _select_component(tableau: Tensor, frame: Tensor, weights: Tensor, edge: Ten
 
 def _exchange(tableau: Tensor, frame: Tensor, edge: Tensor, into: Tensor, where: Tensor) -> None:
     """Replace entry `edge` of the frame by component `into`, and update the tableau in place."""
+    import torch
+
     rows = torch.arange(len(tableau), device=tableau.device)
     row = tableau[rows, into]  # (n, 1 + dim)
     pivot = row[rows, edge + 1]

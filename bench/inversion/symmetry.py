@@ -10,12 +10,15 @@ import dataclasses
 import math
 from dataclasses import dataclass
 from functools import singledispatch
+from typing import TYPE_CHECKING
 
 import numpy as np
-from torch import Tensor
 
 from bench.api import Extractor
 from bench.types import Bytes, Descriptors, Floats, Indices, Points, Release, Subspaces, WordSets
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import functools
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
-from torch import nn
 
 from bench.api import Defense, Extractor
 from bench.codebook.public import Public
-from bench.core.device import pick_device
 from bench.core.errors import UserError
 from bench.formats import tensor_file
-from bench.inversion.network import Inverter, Shape
 from bench.registry import fields, spec
 from bench.settings import Between, OneOf
+
+if TYPE_CHECKING:
+    from torch import nn
+
+    from bench.inversion.network import Inverter, Shape
 
 KIND = "inversion-network"
 REQUIRED_METADATA = (
@@ -36,9 +38,35 @@ STAGE_METADATA = ("start", "crops", "batch", "photographs", "rate", "symmetries"
 class Network:
     """A trained network, ready for inference."""
 
-    module: Inverter
+    path: Path
+    arrays: tensor_file.Arrays
     meta: dict[str, Any]
     digest: str
+
+    @cached_property
+    def module(self) -> Inverter:
+        """The network itself, built at first use.
+
+        Raises
+        ------
+        UserError
+            if its tensors do not match its metadata.
+        """
+        import torch
+
+        from bench.core.device import pick_device
+        from bench.inversion.network import Inverter, Shape
+
+        module = Inverter(Shape(**{**self.meta["shape"], "widths": tuple(self.meta["shape"]["widths"])}))
+        for name, value in module.state_dict().items():
+            if not value.is_floating_point():
+                continue  # batch norm's counter of batches, used in training only
+            if name not in self.arrays or self.arrays[name].shape != tuple(value.shape):
+                actual = self.arrays[name].shape if name in self.arrays else "nothing"
+                raise UserError(f"{self.path}: tensor {name} has shape {actual}, expected {tuple(value.shape)}")
+            value.copy_(torch.from_numpy(self.arrays[name].astype(np.float32)))
+        module.eval().to(pick_device(), memory_format=torch.channels_last)  # type: ignore[call-overload]
+        return module
 
     @property
     def supported_settings(self) -> dict[str, Between | OneOf]:
@@ -61,7 +89,7 @@ def load(path: Path) -> Network:
     Raises
     ------
     UserError
-        if the file is damaged, lacks metadata, or has tensors that do not match its metadata or are not finite.
+        if the file is damaged, lacks metadata, or has tensors that are not finite.
     """
     status = path.stat() if path.is_file() else None
     return _load(path, status and (status.st_mtime_ns, status.st_size))
@@ -76,22 +104,12 @@ def _load(path: Path, version: object) -> Network:
     wrong = sorted({str(array.dtype) for array in arrays.values()} - {"float16", "float32"})
     if wrong:
         raise UserError(f"{path}: weights are {', '.join(wrong)}, expected float16 or float32")
-    shape = Shape(**{**meta["shape"], "widths": tuple(meta["shape"]["widths"])})
-    module = Inverter(shape)
-    for name, value in module.state_dict().items():
-        if not value.is_floating_point():
-            continue  # batch norm's counter of batches, used in training only
-        if name not in arrays or arrays[name].shape != tuple(value.shape):
-            actual = arrays[name].shape if name in arrays else "nothing"
-            raise UserError(f"{path}: tensor {name} has shape {actual}, expected {tuple(value.shape)}")
-        if not np.isfinite(arrays[name]).all():
+    for name, array in arrays.items():
+        if not np.isfinite(array).all():
             raise UserError(f"{path}: tensor {name} has non-finite numbers; train the network anew")
-        value.copy_(torch.from_numpy(arrays[name].astype(np.float32)))
-    module.eval().to(pick_device(), memory_format=torch.channels_last)  # type: ignore[call-overload]
-    return Network(module, meta, digest)
+    return Network(path, arrays, meta, digest)
 
 
-@torch.no_grad()
 def initialise_from(fresh: Inverter, trained: Inverter, candidates: int) -> None:
     """Initialise a network from one for the same kind of release, or from one for raw descriptors.
 
@@ -104,6 +122,13 @@ def initialise_from(fresh: Inverter, trained: Inverter, candidates: int) -> None
     UserError
         if the sizes differ, or `trained` reads neither such releases nor raw descriptors.
     """
+    import torch
+
+    with torch.no_grad():
+        _copy_weights(fresh, trained, candidates)
+
+
+def _copy_weights(fresh: Inverter, trained: Inverter, candidates: int) -> None:
     first = "embed.0.weight"
     old, new = trained.state_dict(), fresh.state_dict()
     if any(old[name].shape != value.shape for name, value in new.items() if name != first):

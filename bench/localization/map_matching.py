@@ -9,17 +9,18 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from bench.api import Defense
 from bench.core.device import pick_device
 from bench.geometry.distances import find_mutual_nearest, points_to_points, subspaces_to_points, subspaces_to_subspaces
 from bench.localization.maps import Map
 from bench.types import Descriptors, Indices, Release, Subspaces, WordSets
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 RATIO = 0.8  # of Lowe's test
 
@@ -97,6 +98,8 @@ class MutualNN(Matcher):
     ratio: float = RATIO
 
     def match(self, release: Release, retrieved: RetrievedReferences) -> Correspondences:
+        import torch
+
         if not isinstance(release, (Descriptors, WordSets)):
             raise TypeError(f"mutual-nn matches descriptors, not {type(release).__name__}")
         sets = release.descriptors[:, None] if isinstance(release, Descriptors) else release.candidates  # (N, m, D)
@@ -189,6 +192,8 @@ def deduplicate(keypoints: Indices, rows: Indices, scene_map: Map) -> Correspond
 
 def _load_descriptors(retrieved: RetrievedReferences, reference: int) -> Tensor:
     """Load the descriptors of a reference. -> (R, D)"""
+    import torch
+
     return torch.from_numpy(retrieved.map.descriptors[retrieved.map.rows(reference)]).to(pick_device())
 
 

@@ -9,10 +9,9 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pycolmap
-import torch
 
 from bench.core.colmap_log import silence_colmap
 from bench.core.device import pick_device
@@ -23,6 +22,9 @@ from bench.images.scene import Reference
 from bench.localization import covisibility
 from bench.localization.maps import Map
 from bench.types import Features, Indices
+
+if TYPE_CHECKING:
+    import pycolmap
 
 RATIO = 0.8  # of the ratio test among references
 EPIPOLAR = 4.0  # pixels
@@ -58,6 +60,8 @@ def verify_matches(
     references: Sequence[Reference], features: Sequence[Features], matches: Iterable[tuple[tuple[int, int], Indices]]
 ) -> Matches:
     """Return the matches that agree with the known poses."""
+    import pycolmap
+
     rays = [_compute_rays(reference, each) for reference, each in zip(references, features, strict=True)]
     inliers = {}
     for (a, b), rows in matches:
@@ -70,6 +74,8 @@ def verify_matches(
 
 def triangulate(references: Sequence[Reference], features: Sequence[Features], matches: Matches) -> tuple[Indices, np.ndarray]:
     """Triangulate with COLMAP. -> (T,) point of each keypoint of all references, or -1; (P, 3)"""
+    import pycolmap
+
     with tempfile.TemporaryDirectory() as scratch, silence_colmap():
         database = Path(scratch) / "database.db"
         model = _write_database(database, references, features, matches)
@@ -87,6 +93,8 @@ def triangulate(references: Sequence[Reference], features: Sequence[Features], m
 
 def _match_pairs(features: Sequence[Features], pairs: Sequence[tuple[int, int]]) -> Iterable[tuple[tuple[int, int], Indices]]:
     """Match mutually nearest descriptors of each pair of references."""
+    import torch
+
     device = pick_device()
     rows = [torch.from_numpy(each.descriptors).to(device) for each in features]
     with Progress("map: matches", len(pairs)) as progress:
@@ -99,6 +107,8 @@ def _write_database(
     database: Path, references: Sequence[Reference], features: Sequence[Features], matches: Matches
 ) -> pycolmap.Reconstruction:
     """Return a model with poses and no points, and fill the database for COLMAP's triangulation. Numbers count from 1."""
+    import pycolmap
+
     model = pycolmap.Reconstruction()
     with pycolmap.Database.open(database) as opened:
         for number, (reference, each) in enumerate(zip(references, features, strict=True), 1):

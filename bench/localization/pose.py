@@ -9,13 +9,15 @@ from __future__ import annotations
 
 from copy import deepcopy
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
 from bench.core.errors import unknown_name
+
+if TYPE_CHECKING:
+    import pycolmap
 
 Doubles = NDArray[np.float64]
 Solver = Literal["poselib", "pycolmap"]
@@ -90,6 +92,8 @@ def estimate_focal_mismatch(xy: Doubles, xyz: Doubles, camera: pycolmap.Camera, 
     more than `MIN_FOCAL_MISMATCH` and its F statistic is above `MIN_F_STATISTIC`: the sum of squares that it saves, over the rest
     per degree of freedom. Few matches, and matches on a plane that faces the camera, give None.
     """
+    import pycolmap
+
     free, pose, inliers = deepcopy(camera), estimated.cam_from_world, estimated.inliers
     options = pycolmap.AbsolutePoseRefinementOptions(refine_focal_length=True)
     for _ in range(ROUNDS):
@@ -111,6 +115,7 @@ def estimate_focal_mismatch(xy: Doubles, xyz: Doubles, camera: pycolmap.Camera, 
 
 def _estimate_with_poselib(xy: Doubles, xyz: Doubles, camera: pycolmap.Camera, trials: int, seed: int) -> Estimate | None:
     import poselib
+    import pycolmap
 
     lens = {"model": camera.model.name, "width": camera.width, "height": camera.height, "params": camera.params.tolist()}
     options = {
@@ -130,6 +135,8 @@ def _estimate_with_poselib(xy: Doubles, xyz: Doubles, camera: pycolmap.Camera, t
 
 
 def _estimate_with_pycolmap(xy: Doubles, xyz: Doubles, camera: pycolmap.Camera, trials: int, seed: int) -> Estimate | None:
+    import pycolmap
+
     options = pycolmap.AbsolutePoseEstimationOptions()
     options.ransac = pycolmap.RANSACOptions(
         max_error=MAX_ERROR,

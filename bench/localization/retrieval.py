@@ -8,12 +8,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.sparse
 from numpy.typing import NDArray
 
 from bench.types import Indices
+
+if TYPE_CHECKING:
+    import scipy.sparse
 
 TOP = 20  # references of a query (the paper's Sec. 6.2)
 
@@ -36,6 +39,8 @@ class Bags:
     @cached_property
     def _counts(self) -> scipy.sparse.csr_matrix:
         """(V, K) the number of times that each reference has each word."""
+        import scipy.sparse
+
         ones = np.ones(len(self.words))
         return scipy.sparse.csr_matrix((ones, self.words, self.starts), shape=(len(self.starts) - 1, self.size))
 
@@ -60,5 +65,7 @@ class Bags:
 
 
 def _normalize(rows: scipy.sparse.csr_matrix) -> scipy.sparse.csr_matrix:
+    import scipy.sparse
+
     norms = np.sqrt(np.asarray(rows.multiply(rows).sum(axis=1)).ravel())
     return scipy.sparse.diags(1 / np.where(norms > 0, norms, 1)) @ rows

@@ -109,10 +109,10 @@ class SceneIndex:
 
     def _collect_codes(self, extractor: Extractor) -> Bytes:
         """Collect the descriptors of all references. -> (n, D)"""
-        found = [
+        all_codes = [
             features.codes for features in feature_cache.extract_all(extractor, [image.pixels for image in self.scene.references])
         ]
-        codes = [each for each in found if each is not None]
-        if len(codes) < len(found):
+        codes = [each for each in all_codes if each is not None]
+        if len(codes) < len(all_codes):
             raise UserError(f"{extractor.name()} gives no 8-bit descriptors, from which a dictionary's words are clustered")
         return np.concatenate(codes)

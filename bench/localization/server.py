@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pycolmap
 
 from bench.api import Defense
 from bench.codebook.dictionary import Dictionary
@@ -19,6 +19,9 @@ from bench.localization.retrieval import TOP
 from bench.localization.scene_index import SceneIndex
 from bench.registry import spec
 from bench.types import Bytes, Descriptors, Features, Floats, Indices, Points, Release, Subspaces, WordSets
+
+if TYPE_CHECKING:
+    import pycolmap
 
 RETRIEVAL_WORDS = 16_000  # for retrieval by descriptors, if the references have four times as many keypoints
 CHECK_TRIALS = 1000  # of RANSAC on raw features, most of whose matches are correct
@@ -100,10 +103,10 @@ class Server:
         rng = derive_generator(
             "lifted reference", self.scene_index.digest, reference, spec.to_json_with_digests(defense, self.public)
         )
-        lifted = defense.protect(self.scene_index.reference_features[reference], self.public, rng)
-        if not isinstance(lifted, Subspaces):
+        subspaces = defense.protect(self.scene_index.reference_features[reference], self.public, rng)
+        if not isinstance(subspaces, Subspaces):
             raise TypeError(f"{defense.name()} lifts nothing")
-        return lifted
+        return subspaces
 
     def _gather_points(self, release: Release, pairs: Correspondences) -> tuple[np.ndarray, np.ndarray]:
         """Gather pixels and points. -> (C, 2), (C, 3) float64"""

@@ -7,9 +7,9 @@ descriptor. `map_matching` matches a release with the points of a map.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
-import torch
-from torch import Tensor
 
 from bench.api import Defense
 from bench.codebook.public import Public
@@ -18,6 +18,9 @@ from bench.geometry.distances import find_mutual_nearest, points_to_points, subs
 from bench.geometry.shared_words import find_shared_words
 from bench.registry import fields
 from bench.types import Descriptors, Features, Indices, Points, Release, Subspaces, WordSets
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 def prepare_unprotected(features: Features, defense: Defense, public: Public) -> Release:
@@ -68,6 +71,8 @@ def _compute_squared_distances(first: Release, second: Release) -> Tensor:
 
 def _load_descriptors(release: Release) -> Tensor:
     """Load descriptors or candidates. -> (N or N m, D)"""
+    import torch
+
     if isinstance(release, Descriptors):
         rows = release.descriptors
     elif isinstance(release, WordSets):

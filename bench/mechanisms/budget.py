@@ -5,17 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from bench.core.errors import UserError
+from bench.core.table import Table, build_table
 from bench.mechanisms.composition import DELTA, UNCOVERED, compose_basic, compose_optimal, solve_epsilon
 from bench.mechanisms.subset import log10_chance, most_accurate_size, most_informative_size, mutual_information
-
-if TYPE_CHECKING:
-    from rich.table import Table
-    from rich.text import Text
 
 SIZES = (1, 2, 4)  # subset sizes shown beside the best ones
 
@@ -99,38 +96,31 @@ def select_nearest_records(records: Sequence[Mapping[str, Any]], epsilon: float)
     return [record for record, distance in zip(records, distances, strict=True) if distance == np.nanmin(distances)]
 
 
-def report(plan: Budget) -> Iterator[Text | Table]:
+def report(plan: Budget) -> Iterator[Table | str]:
     """Yield the budget as terminal output."""
-    from rich.table import Table
-    from rich.text import Text
-
     released = "released once" if plan.releases == 1 else f"released {plan.releases} times"
-    yield Text(
+    yield (
         f"ε = {plan.image:g} for a photograph of {plan.keypoints} keypoints, {released}:\n"
         f"- basic composition leaves ε = {plan.basic_epsilon:.4g} for a descriptor\n"
         f"- the optimal one (Kairouz, Oh and Viswanath) at δ = {DELTA:g} leaves ε = {plan.optimal_epsilon:.4g}\n"
         f"- not covered: {', '.join(UNCOVERED)}\n"
     )
-    table = Table(
-        title=Text(f"At ε = {plan.epsilon:.4g}, of {plan.words} words"),
-        caption=Text(
-            "Pr(a word of it is true): the chance that a guess is right, for an attacker and for a matching server; "
-            f"without any release it is {1 / plan.words:.3g}.\n"
-            "* most information about the true word † most accurate word frequencies"
-        ),
-        title_justify="left",
-        caption_justify="left",
-    )
-    for column in ("words in a set", "Pr(true)", "Pr(a word of it is true)", "true words in all", "bits"):
-        table.add_column(column, justify="right")
     symbols = {most_accurate_size(plan.epsilon, plan.words): " †"}
     symbols[most_informative_size(plan.epsilon, plan.words)] = " *"
-    for row in compute_yields(plan):
-        table.add_row(
+    rows = [
+        (
             f"{row.size}{symbols.get(row.size, '')}",
             f"{row.inclusion:.4g}",
             f"{row.inclusion / row.size:.4g}",
             f"{row.true_words:.4g} of {plan.keypoints}",
             f"{row.bits:.3g} of {math.log2(plan.words):.3g}",
         )
-    yield table
+        for row in compute_yields(plan)
+    ]
+    columns = ("words in a set", "Pr(true)", "Pr(a word of it is true)", "true words in all", "bits")
+    remark = (
+        "Pr(a word of it is true): the chance that a guess is right, for an attacker and for a matching server; "
+        f"without any release it is {1 / plan.words:.3g}.\n"
+        "* most information about the true word † most accurate word frequencies"
+    )
+    yield build_table(columns, rows, heading=f"At ε = {plan.epsilon:.4g}, of {plan.words} words", remarks=[remark])

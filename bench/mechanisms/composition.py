@@ -11,8 +11,6 @@ from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
-from scipy.optimize import brentq
-from scipy.special import gammaln
 
 DELTA = 1e-6
 # Parts of a release that no ε covers.
@@ -40,6 +38,8 @@ def compose_optimal(epsilon: float, answers: int, delta: float = DELTA) -> float
     answers : N
     delta : from 0, which gives basic composition, up to but not including 1
     """
+    from scipy.special import gammaln
+
     if answers == 0 or epsilon == 0 or math.isinf(epsilon) or delta == 0:
         return compose_basic(epsilon, answers)
     lies = np.arange(answers + 1)
@@ -60,6 +60,8 @@ def compose(epsilon: float, answers: int, delta: float = DELTA) -> float:
 
 def solve_epsilon(total: float, answers: int, cost: Callable[[float, int], float] = compose) -> float:
     """Return the ε of one answer at which `answers` of them, at least 1, together cost `total`."""
+    from scipy.optimize import brentq
+
     if total == 0 or math.isinf(total):
         return total
     return float(brentq(lambda epsilon: cost(epsilon, answers) - total, 0.0, 2 * total + 10, xtol=1e-12, rtol=1e-12))

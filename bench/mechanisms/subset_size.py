@@ -19,21 +19,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
 from bench.core.errors import UserError
+from bench.core.table import Table, build_table
 from bench.mechanisms.subset import log10_chance, most_accurate_size, most_informative_size, mutual_information
 from bench.types import Indices
-
-if TYPE_CHECKING:
-    from rich.table import Table
-    from rich.text import Text
 
 Doubles = NDArray[np.float64]
 
@@ -161,30 +158,21 @@ def _is_comparable(record: Mapping[str, Any], trials: int, condition: str) -> bo
     )
 
 
-def report(rows: Sequence[SizeEstimate], epsilon: float, domain: int, recalls: dict[int, list[float]]) -> Iterator[Text | Table]:
-    """Yield the predictions as terminal output."""
-    from rich.table import Table
-    from rich.text import Text
-
+def report(rows: Sequence[SizeEstimate], epsilon: float, domain: int, recalls: dict[int, list[float]]) -> Table:
+    """Return a table of the predictions."""
     best = max(rows, key=lambda row: row.success).size
-    table = Table(
-        title=Text(f"Sets of m of {domain} words at ε = {epsilon:g}"),
-        caption=Text(
-            f"‡ RANSAC finds the pose most likely * most information about its word: m = "
-            f"{most_informative_size(epsilon, domain)} "
-            f"† most accurate word frequencies: m = {most_accurate_size(epsilon, domain)}"
-        ),
-        title_justify="left",
-        caption_justify="left",
-    )
-    columns = ["m", "Pr(true)", "bits", "right matches", "wrong matches", "Pr(pose found)"]
-    for column in [*columns, *(["measured"] if recalls else [])]:
-        table.add_column(column, justify="right")
+    columns = ["m", "Pr(true)", "bits", "right matches", "wrong matches", "Pr(pose found)", *(["measured"] if recalls else [])]
     symbols = {most_accurate_size(epsilon, domain): " †", most_informative_size(epsilon, domain): " *"}
+    texts = []
     for row in rows:
         symbol = symbols.get(row.size, "") + (" ‡" if row.size == best else "")
-        cells = [f"{row.inclusion:.4g}", f"{row.bits:.3g}", f"{row.right:.4g}", f"{row.wrong:.4g}", f"{row.success:.3f}"]
+        numbers = [f"{row.inclusion:.4g}", f"{row.bits:.3g}", f"{row.right:.4g}", f"{row.wrong:.4g}", f"{row.success:.3f}"]
         values = recalls.get(row.size)
         measured = [] if not recalls else [f"{np.mean(values):.3f} of {len(values)}" if values else "n/a"]
-        table.add_row(f"{row.size}{symbol}", *cells, *measured)
-    yield table
+        texts.append([f"{row.size}{symbol}", *numbers, *measured])
+    remark = (
+        f"‡ RANSAC finds the pose most likely * most information about its word: m = "
+        f"{most_informative_size(epsilon, domain)} "
+        f"† most accurate word frequencies: m = {most_accurate_size(epsilon, domain)}"
+    )
+    return build_table(columns, texts, heading=f"Sets of m of {domain} words at ε = {epsilon:g}", remarks=[remark])

@@ -6,11 +6,13 @@ A plugin is imported only when it is loaded, so `bench --help` imports no heavy 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import importlib
 import importlib.util
 import inspect
 import pkgutil
 import re
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.abc import InspectLoader
@@ -143,8 +145,14 @@ def _build_loader(module: str) -> Callable[[], Any]:
 def _list_external(group: str) -> list[Entry]:
     return [
         Entry(point.name, f"{point.value} (of {point.dist.name if point.dist else 'an unknown distribution'})", point.load)
-        for point in entry_points(group=group)
+        for point in _read_entry_points(tuple(sys.path)).select(group=group)
     ]
+
+
+@functools.lru_cache(maxsize=1)
+def _read_entry_points(path: tuple[str, ...]) -> Any:
+    """Read the entry points of all distributions, once for each search path."""
+    return entry_points()
 
 
 def _format_name(plugin: Any) -> str:

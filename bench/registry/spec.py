@@ -102,6 +102,6 @@ def _encode(kind: Any, value: Any) -> Any:
 
 def _parse_field(plugin: type[Plugin], field: str, kind: Any, text: str) -> Any:
     try:
-        return fields.parse_parse_field(kind, text)
+        return fields.parse_value(kind, text)
     except ValueError:
         raise UserError(f"{plugin.name()}: {field} must be {fields.describe_type(kind)}, not {text!r}") from None

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from bench.images.photographs import decode, list_objects
-from bench.rendering.noise import Size, draw_voronoi, to_colour, draw_palette, draw_noise, pixels, interpolate_colours
+from bench.rendering.noise import Size, draw_noise, draw_palette, draw_voronoi, interpolate_colours, pixels, to_colour
 from bench.types import Bytes
 
 FONTS = (

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bench.rendering import surfaces
-from bench.rendering.furniture import Footprint, Surface, furnish, compute_lamp_positions
+from bench.rendering.furniture import Footprint, Surface, compute_lamp_positions, furnish
 from bench.rendering.light import Lamp, Lighting, Occluders, compute_light
 from bench.rendering.mipmap import Texture, sample
 from bench.rendering.noise import draw_noise, pixels
@@ -83,7 +83,8 @@ def _create_night_lighting(rng: np.random.Generator) -> Lighting:
         positions = compute_lamp_positions(room)[rng.integers(2) :: 2]
         strength = rng.uniform(0.5, 1.0)
         lights += [
-            Lamp(at=(x, y, min(room.height, 3.6) - 0.4), colour=(strength, 0.72 * strength, 0.42 * strength)) for x, y in positions
+            Lamp(at=(x, y, min(room.height, 3.6) - 0.4), colour=(strength, 0.72 * strength, 0.42 * strength))
+            for x, y in positions
         ]
     return Lighting(
         lamps=tuple(lights), sun=(0, 0, 0), towards_sun=(0, 0, 1.0), sky=(0.008, 0.012, 0.024), bounce=(0.016, 0.013, 0.01)

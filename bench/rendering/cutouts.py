@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 
 from bench.images.photographs import decode, list_people
-from bench.rendering.artworks import draw_blobs, draw_text, draw_mosaic
-from bench.rendering.noise import to_colour, draw_palette, draw_noise, pixels
+from bench.rendering.artworks import draw_blobs, draw_mosaic, draw_text
+from bench.rendering.noise import draw_noise, draw_palette, pixels, to_colour
 from bench.types import Bytes, Floats
 
 TALL, WIDE = 480, 224  # pixels of a cut-out

@@ -73,6 +73,6 @@ def sample(image: np.ndarray, u: Floats, v: Floats) -> Floats:
     x -= 0.5  # OpenCV's centre of the first pixel is 0
     y -= 0.5
     maps = x.reshape(rows, ROW), y.reshape(rows, ROW)
-    found = cv2.remap(image, *maps, interpolation=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    values: np.ndarray = found.reshape(rows * ROW, -1)[:count]
+    samples = cv2.remap(image, *maps, interpolation=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    values: np.ndarray = samples.reshape(rows * ROW, -1)[:count]
     return to_linear(values) if image.dtype == np.uint8 else values

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from bench.images.photographs import decode, list_ground_textures
-from bench.rendering.noise import Size, draw_voronoi, to_colour, draw_palette, draw_noise, pixels
+from bench.rendering.noise import Size, draw_noise, draw_palette, draw_voronoi, pixels, to_colour
 from bench.types import Bytes, Floats
 
 

@@ -79,7 +79,7 @@ class TrialRunner:
         """
         plan, attack = self.plan, experiment.attack
         images, content = self._protect_sample(experiment.defense, sample), plan.hashes[sample.name]
-        made_with = experiment.metadata["defense"], experiment.metadata["dataset"]["extractor"]
+        configurations = experiment.metadata["defense"], experiment.metadata["dataset"]["extractor"]
         # Without the task's settings: an attack whose descriptors another inverter reconstructs draws the same numbers.
         configuration = attack and spec.to_json_with_digests(
             attack, plan.public, attack.assets(experiment.defense, plan.extractor, plan.public)
@@ -88,7 +88,7 @@ class TrialRunner:
             "seed": plan.seed,
             "dataset": [experiment.metadata["dataset"]["hash"], self._order],
             "unit": [sample.name, content],
-            "made with": made_with,
+            "made with": configurations,
         }
         return Trial(
             sample=sample,
@@ -98,7 +98,7 @@ class TrialRunner:
             extractor=plan.extractor,
             public=plan.public,
             metrics=plan.metrics,
-            rng=derive_generator("attack", plan.seed, content, *made_with, configuration),
+            rng=derive_generator("attack", plan.seed, content, *configurations, configuration),
             others=self._pool(experiment.defense).without(sample.name),
             repeats=tuple(
                 self.protect(experiment, images[0].secret, content, number)
@@ -111,11 +111,11 @@ class TrialRunner:
     def protect(self, experiment: Experiment, features: Features, content: str, *repetition: int | str) -> Release:
         """Return the release of features whose photograph has that content hash; the first release has no `repetition`."""
         plan, defense = self.plan, experiment.defense
-        made_with = experiment.metadata["defense"], experiment.metadata["dataset"]["extractor"]
+        configurations = experiment.metadata["defense"], experiment.metadata["dataset"]["extractor"]
         if defense.is_memoized():  # all photographs, and all their repetitions, come from one device
-            rng = derive_generator("device", plan.seed, *made_with)
+            rng = derive_generator("device", plan.seed, *configurations)
         else:
-            rng = derive_generator("release", plan.seed, content, *made_with, *repetition)
+            rng = derive_generator("release", plan.seed, content, *configurations, *repetition)
         with wrap_plugin_errors(f"plugin {defense.name()}"):
             release = defense.protect(features, plan.public, rng)
             if not isinstance(release, defense.releases):

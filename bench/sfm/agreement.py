@@ -8,11 +8,14 @@ wins.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pycolmap
 
 from bench.sfm.incremental_mapping import Model
+
+if TYPE_CHECKING:
+    import pycolmap
 
 MAX_OFFSET = 0.05  # fraction of the largest distance between two of the true cameras
 MAX_ANGLE = 5.0  # degrees

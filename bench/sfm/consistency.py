@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from bench.types import Indices
 
@@ -34,6 +33,8 @@ def count_support(first: Doubles, second: Doubles, near: float, similar: float) 
     ----------
     near, similar : largest difference along each axis of positions in the first image, and of displacements, in pixels
     """
+    from scipy.spatial import cKDTree
+
     points = _embed(first, second, near, similar)
     return np.asarray(cKDTree(points).query_ball_point(points, 1.0, p=np.inf, return_length=True), np.int64) - 1
 
@@ -66,6 +67,8 @@ def _is_clean(support: Indices, chance: Indices) -> bool:
 
 def find_supported(first: Doubles, second: Doubles, trusted: Indices, longer: float) -> Indices:
     """Find the matches near another, trusted match with a similar displacement. -> (M',) their rows, ascending"""
+    from scipy.spatial import cKDTree
+
     points = _embed(first, second, NEAR * longer, SIMILAR * longer)
     counts = np.asarray(cKDTree(points[trusted]).query_ball_point(points, 1.0, p=np.inf, return_length=True))
     counts[trusted] -= 1

@@ -11,15 +11,17 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-import pycolmap
 
 from bench.core.colmap_log import silence_colmap
 from bench.sfm.consistency import Doubles
 from bench.sfm.verification import Geometry, Pair
 from bench.types import Floats
+
+if TYPE_CHECKING:
+    import pycolmap
 
 Mapper = Literal["incremental", "global"]
 
@@ -60,6 +62,8 @@ def build_model(
     camera : of all images
     keypoints : (N, 2) of each image
     """
+    import pycolmap
+
     with tempfile.TemporaryDirectory() as scratch, silence_colmap():
         database = Path(scratch) / "database.db"
         _write_database(database, camera, keypoints, geometries)
@@ -73,6 +77,8 @@ def build_model(
 
 
 def _incremental_options(seed: int) -> pycolmap.IncrementalPipelineOptions:
+    import pycolmap
+
     options = pycolmap.IncrementalPipelineOptions(
         random_seed=seed,
         num_threads=1,
@@ -90,6 +96,8 @@ def _incremental_options(seed: int) -> pycolmap.IncrementalPipelineOptions:
 
 
 def _global_options(seed: int) -> pycolmap.GlobalPipelineOptions:
+    import pycolmap
+
     options = pycolmap.GlobalPipelineOptions(random_seed=seed, num_threads=1, min_model_size=MIN_IMAGES)
     adjustment = options.mapper.bundle_adjustment
     adjustment.refine_focal_length = adjustment.refine_principal_point = adjustment.refine_extra_params = False
@@ -101,6 +109,8 @@ def _write_database(
     database: Path, camera: pycolmap.Camera, keypoints: Sequence[Floats], geometries: Mapping[Pair, Geometry]
 ) -> None:
     """Write all that mapping needs into a database. Numbers count from 1."""
+    import pycolmap
+
     model = pycolmap.Reconstruction()
     calibrated = pycolmap.Camera(camera.todict() | {"camera_id": 1, "has_prior_focal_length": True})
     model.add_camera_with_trivial_rig(calibrated)
@@ -124,6 +134,8 @@ def _write_database(
 
 
 def _summarize(model: pycolmap.Reconstruction) -> Model:
+    import pycolmap
+
     model.update_point_3d_errors()
     numbers = [number for number in sorted(model.reg_image_ids()) if model.image(number).num_points3D >= MIN_POINTS]
     return Model(

@@ -10,13 +10,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pycolmap
 
 from bench.core.progress import Progress
 from bench.sfm.consistency import Doubles, find_supported, select_consistent
 from bench.types import Floats, Indices
+
+if TYPE_CHECKING:
+    import pycolmap
 
 MAX_ERROR = 3.0  # pixels off the epipolar line, in COLMAP's Sampson error
 TRIALS = 10_000  # of RANSAC
@@ -83,6 +86,8 @@ def estimate_geometry(
     first, second : (N, 2), (N', 2) keypoints
     matches : (M, 2)
     """
+    import pycolmap
+
     a, b = first[matches[:, 0]].astype(np.float64), second[matches[:, 1]].astype(np.float64)  # (M, 2) pixels
     longer = float(max(camera.width, camera.height))
     consistent = select_consistent(a, b, longer, MIN_CONSISTENT, rng)
@@ -110,6 +115,8 @@ def estimate_geometry(
 
 def _compute_errors(camera: pycolmap.Camera, first: Doubles, second: Doubles, essential: Doubles) -> Doubles:
     """Compute Sampson errors in pixels. (M, 2), (M, 2) pixels -> (M,)"""
+    import pycolmap
+
     if len(first) == 0:
         return np.empty(0)
     a, b = (np.asarray(camera.cam_from_img(points)) for points in (first, second))

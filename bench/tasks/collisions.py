@@ -1,17 +1,19 @@
-"""Collisions: whether other subspaces that meet a subspace come near its descriptor, too (the paper's Table S4).
+"""Collisions: whether subspaces that intersect a subspace also come near its descriptor (the paper's Table S4).
 
-The clustering attack tells d from the adversarial a_i by the subspaces Q' that meet D, of the same release and of others: they go
-through some a_i and should stay far from d. The paper leaves the test open; here a descriptor has no collision if
+The clustering attack separates d from the adversarial a_i by the subspaces Q' that intersect D, of the same release and of
+others. They pass through some a_i and should stay far from d. The paper does not state its test; here a descriptor has no
+collision if
 
     min_j dist(d, Q'_j) > max_i min_j dist(a_i, Q'_j) + τ
 
-An a_i that no other subspace goes through makes the right side large and counts as a collision, as does a descriptor without Q'.
-`coverage` is the share of the a_i that are met, and `no_collision_covered` the share among the descriptors of which all a_i are.
+An a_i on no other subspace makes the right side large and counts as a collision, as does a descriptor without Q'. `coverage` is
+the fraction of the a_i that other subspaces pass through. `no_collision_covered` is the fraction among descriptors with all a_i
+covered.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,17 +29,16 @@ from bench.geometry.shared_sub_database import compute_intersection_distances, f
 from bench.images.samples import Collection, Images, collect_only_photographs
 from bench.registry import fields
 from bench.task_api import Outcome, Task, Trial
-from bench.types import Release, Subspaces
 
 
 @dataclass(frozen=True, kw_only=True)
 class Collisions(Task):
-    """How often no other release that meets a subspace comes near its descriptor. Made by the owner, who knows what it hides."""
+    """How often no subspace that intersects another comes near its descriptor. Computed by the owner."""
 
     judges_attacks = False
 
-    coverage: float = 0.95  # releases are asked for until this share of the photograph's words is met
-    others: int = 800  # releases of other photographs that there are to ask for
+    coverage: float = 0.95  # other releases are drawn until this fraction of the photograph's words is covered
+    others: int = 800  # releases of other photographs, at most
     tolerance: float = 0.3  # τ, a distance of unit descriptors
 
     def __post_init__(self) -> None:
@@ -61,23 +62,21 @@ class Collisions(Task):
         defense = trial.defense
         if not isinstance(defense, Lifting):
             raise SampleError("collisions needs subspaces through words of a database")
-        lifted = defense.lift(trial.secret, trial.public, trial.rng)
+        lifting = defense.lift(trial.secret, trial.public, trial.rng)
         words = trial.public.dictionary(fields.list_assets(defense)["database"]).words  # (K, D)
         points = np.concatenate(
-            [trial.secret.descriptors[:, None], unit_rows(words[lifted.words])], axis=1
+            [trial.secret.descriptors[:, None], unit_rows(words[lifting.words])], axis=1
         )  # (N, 1 + a, D) d, a_i
-        shared = find_shared_sub_database(
-            lifted.release, _check_subspaces(trial.others(self.others)), defense.adversarial, self.coverage
-        )
+        shared = find_shared_sub_database(lifting.release, trial.others(self.others), defense.adversarial, self.coverage)
         nearest = compute_intersection_distances(points.astype(np.float64), shared)  # (N, 1 + a)
         clear = is_collision_free(nearest, self.tolerance)
-        met = nearest[:, 1:] < INTERSECTION_DISTANCE  # (N, a)
-        covered = met.all(axis=1)
+        intersected = nearest[:, 1:] < INTERSECTION_DISTANCE  # (N, a)
+        covered = intersected.all(axis=1)
         return Outcome(
             metrics={
                 "no_collision": float(clear.mean()),
                 "no_collision_covered": float(clear[covered].mean()) if covered.any() else None,
-                "coverage": float(met.mean()),
+                "coverage": float(intersected.mean()),
                 "covered": float(covered.mean()),
                 "releases_asked": float(shared.searched),
                 "releases_kept": float(shared.sharing),
@@ -86,16 +85,9 @@ class Collisions(Task):
 
 
 def is_collision_free(nearest: Doubles, tolerance: float) -> NDArray[np.bool_]:
-    """Whether d, the first point, is further from what meets D than the others by more than `tolerance`. (N, 1 + a) -> (N,)"""
+    """Whether d, the first point, is further from other subspaces than all a_i, by more than `tolerance`. (N, 1 + a) -> (N,)"""
     own, adversarial = nearest[:, 0], nearest[:, 1:].max(axis=1)
     return np.isfinite(own) & (own > adversarial + tolerance)
-
-
-def _check_subspaces(releases: Iterator[Release]) -> Iterator[Subspaces]:
-    for release in releases:
-        if not isinstance(release, Subspaces):
-            raise SampleError(f"collisions needs subspaces, got {type(release).__name__}")
-        yield release
 
 
 PLUGIN = Collisions

@@ -1,14 +1,14 @@
-"""Intersections: whether the words near a subspace lie around the points that it was made of (the paper's Table S3).
+"""Intersections: whether the words near a subspace lie around the points that it goes through (the paper's Table S3).
 
 The paper: "for each subspace, we select the top N database descriptors closest to the subspace, and match them to the m/2 + 1
 descriptors forming the subspace. Using the standard ratio test we report the percentage of successful matches."
 
-As read here: the N words of the database that are nearest to the subspace, the m/2 adversarial ones left out, are matched to d
-and the a_i; a match succeeds if the nearest of those m/2 + 1 points is less than 0.8 times as far as the second nearest.
-With the adversarial words among the N, success at N = 5 and m = 16 is 100% by construction (five of the eight words that lie in
-the subspace match themselves), and the paper prints 94.38%; that share is measured as `with_adversarial_top5` and so on.
-Matching the other way, each of the m/2 + 1 points to its nearest among the N words, succeeds more often as m grows, as all a_i
-are words and match themselves; the paper's falls.
+Here the N words of the database nearest to the subspace, without the m/2 adversarial ones, are matched to d and the a_i. A match
+succeeds if the nearest of those m/2 + 1 points is less than 0.8 times as far as the second nearest.
+With the adversarial words among the N, success at N = 5 and m = 16 is 100% by construction: five of the eight words in the
+subspace match themselves. The paper prints 94.38%. That fraction is recorded as `with_adversarial_top5` and so on.
+Matching the other way, each of the m/2 + 1 points to its nearest among the N words, succeeds more often as m grows, because all
+a_i are words and match themselves; the paper's success falls.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ from bench.task_api import Outcome, Task, Trial
 from bench.types import Features, Floats
 
 COUNTS = (50, 20, 10, 5)  # N
-BATCH = 64  # subspaces at a time
+BATCH = 64  # subspaces
 
 
 @dataclass(frozen=True, kw_only=True)
 class Intersections(Task):
-    """How often the words nearest to a subspace match one of the points that it goes through. Made by the owner, who knows them.
+    """How often the words nearest to a subspace match one of the points that it goes through. Computed by the owner.
 
-    The descriptors of a photograph are lifted again and again until there are `subspaces` liftings, or each once for 0.
+    The descriptors of a photograph are lifted repeatedly until there are `subspaces` liftings, or each once for 0.
     """
 
     judges_attacks = False
@@ -69,16 +69,16 @@ class Intersections(Task):
         count = self.subspaces or len(trial.secret)
         alone, among = [], []
         for secret in draw_rounds(trial.secret, count, trial.rng):
-            lifted = defense.lift(secret, trial.public, trial.rng)
-            near, _ = find_nearest_to_subspaces(lifted.release, words, max(COUNTS) + defense.adversarial)  # (n, N + a)
+            lifting = defense.lift(secret, trial.public, trial.rng)
+            near, _ = find_nearest_to_subspaces(lifting.release, words, max(COUNTS) + defense.adversarial)  # (n, N + a)
             for rows in np.array_split(np.arange(len(near)), -(-len(near) // BATCH)):
                 points = np.concatenate(
-                    [secret.descriptors[rows, None], unit_rows(words[lifted.words[rows]])], axis=1
+                    [secret.descriptors[rows, None], unit_rows(words[lifting.words[rows]])], axis=1
                 )  # (b, 1 + a, D)
                 match = pass_ratio_test(unit_rows(words[near[rows]]), points, self.ratio)  # (b, N + a)
                 among.append(match)
                 alone.append(
-                    drop_left_out(match, (near[rows][:, :, None] == lifted.words[rows][:, None]).any(axis=2), max(COUNTS))
+                    drop_left_out(match, (near[rows][:, :, None] == lifting.words[rows][:, None]).any(axis=2), max(COUNTS))
                 )
         return Outcome(
             metrics={
@@ -90,28 +90,28 @@ class Intersections(Task):
 
 
 def draw_rounds(secret: Features, count: int, rng: np.random.Generator) -> Iterator[Features]:
-    """The descriptors in random order, again and again, until there are `count` of them."""
+    """Yield the descriptors in random order, repeatedly, until there are `count` of them."""
     while count > 0:
-        chosen = np.sort(rng.permutation(len(secret))[:count])
-        yield secret.take(chosen)
-        count -= len(chosen)
+        rows = np.sort(rng.permutation(len(secret))[:count])
+        yield secret.take(rows)
+        count -= len(rows)
 
 
 def pass_ratio_test(words: Floats, points: Floats, ratio: float) -> NDArray[np.bool_]:
     """Whether a word's nearest point is less than `ratio` times as far as its second nearest. (n, N, D), (n, p, D) -> (n, N)"""
-    away = np.linalg.norm(words[:, :, None].astype(np.float64) - points[:, None], axis=3)  # (n, N, p)
-    nearest, second = np.moveaxis(np.partition(away, 1, axis=2)[:, :, :2], 2, 0)
+    distances = np.linalg.norm(words[:, :, None].astype(np.float64) - points[:, None], axis=3)  # (n, N, p)
+    nearest, second = np.moveaxis(np.partition(distances, 1, axis=2)[:, :, :2], 2, 0)
     return nearest < ratio * second
 
 
 def drop_left_out(match: NDArray[np.bool_], left_out: NDArray[np.bool_], count: int) -> NDArray[np.bool_]:
-    """Of each row the first `count` that are not left out. (n, N + a), (n, N + a) -> (n, count)"""
+    """Return the first `count` of each row that are not left out. (n, N + a), (n, N + a) -> (n, count)"""
     order = np.argsort(left_out, axis=1, kind="stable")[:, :count]
     return np.take_along_axis(match, order, axis=1)
 
 
 def _compute_fractions(name: str, match: list[NDArray[np.bool_]]) -> dict[str, float]:
-    """The share of successes among the first N columns, for each N."""
+    """Compute the fraction of successes among the first N columns, for each N."""
     rows = np.concatenate(match)
     return {f"{name}_top{count}": float(rows[:, :count].mean()) for count in COUNTS}
 

@@ -1,7 +1,7 @@
-"""Localization: how near a server comes to the pose of the camera that a release is from (the paper's Sec. 6.2).
+"""Localization: the server's error in the pose of a release's camera (the paper's Sec. 6.2).
 
 Queries are privatised, references are not. For each query the server retrieves references, matches the release with them, and
-estimates the pose with fixed intrinsics. A query that it cannot localize counts as not localized.
+estimates the pose with fixed intrinsics. A query without an estimate counts as not localized.
 """
 
 from __future__ import annotations
@@ -26,28 +26,28 @@ from bench.localization.server import Server
 from bench.task_api import Outcome, Task, Trial
 from bench.types import Features, Indices
 
-# Within which a pose counts: units of length and degrees (Sattler et al., CVPR 2018).
+# Largest errors of a localized pose: units of length and degrees (Sattler et al., CVPR 2018).
 THRESHOLDS = {"0.25m_2deg": (0.25, 2.0), "0.5m_5deg": (0.5, 5.0), "5m_10deg": (5.0, 10.0)}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Localization(Task):
-    """How many queries of a place a server can localize from what was released of them.
+    """How many queries of a scene a server can localize from their releases.
 
-    Retrieval is `raw` (by the raw descriptors of the query, the same for every defense, as in the paper, where it leaks what the
-    paper does not count) or `released` (by nothing but what was released), unless a file of pairs is given.
+    Retrieval is `raw` (by the query's raw descriptors, the same for every defense, as in the paper, which does not count this
+    leak) or `released` (by the release alone), unless a file of pairs is given.
     """
 
     judges_attacks: ClassVar[bool] = False
     needs_scene: ClassVar[bool] = True
     needs_map: ClassVar[bool] = True
 
-    # auto: what serves the release best, where references are not lifted
+    # auto: the best one for the release among those that do not lift references
     matcher: Literal["auto", "vocabulary", "noisy-nn", "mutual-nn", "point-to-subspace", "subspace-to-subspace"] = "auto"
     retrieval: Literal["raw", "released"] = "raw"
-    retrieved: int = 20  # references of a query
+    retrieved: int = 20  # references per query
     trials: int = 30_000  # of RANSAC, at most
-    pairs: Path | None = None  # a file in hloc's format that says which references were retrieved
+    pairs: Path | None = None  # a file of retrieved references in hloc's format
 
     def __post_init__(self) -> None:
         if self.retrieved < 1 or self.trials < 1:
@@ -55,7 +55,7 @@ class Localization(Task):
 
     def collect(self, images: Images, dataset: Dataset | None) -> Collection:
         if images is not None:
-            raise UserError("localization is about the queries of a dataset and takes no images; give --dataset")
+            raise UserError("localization takes the queries of a dataset and no images; give --dataset")
         return samples.collect_queries(dataset or Gallery())
 
     def explain_not_applicable(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> str | None:
@@ -75,21 +75,23 @@ class Localization(Task):
         if matcher is None:
             raise SampleError(f"nothing matches {type(trial.release).__name__}")
         references, seed = self._retrieve(server, trial, query), int(trial.rng.integers(2**31))
-        found = server.localize(trial.release, trial.defense, references, matcher, self.trials, seed)
-        told = {
-            "matches": float(len(found.correspondences)),
-            "inliers": 0.0 if found.estimate is None else float(found.estimate.inliers.sum()),
-            "trials": 0.0 if found.estimate is None else float(found.estimate.trials),
+        result = server.localize(trial.release, trial.defense, references, matcher, self.trials, seed)
+        counts = {
+            "matches": float(len(result.correspondences)),
+            "inliers": 0.0 if result.estimate is None else float(result.estimate.inliers.sum()),
+            "trials": 0.0 if result.estimate is None else float(result.estimate.trials),
         }
-        there = None if found.estimate is None else found.estimate.cam_from_world
+        cam_from_world = None if result.estimate is None else result.estimate.cam_from_world
         estimates = {
-            "pose": None if there is None else [*lists.to_wxyz(there).tolist(), *there.translation.tolist()],
+            "pose": None
+            if cam_from_world is None
+            else [*lists.to_wxyz(cam_from_world).tolist(), *cam_from_world.translation.tolist()],
             "retrieved": [server.scene_index.map.names[reference] for reference in references],
         }
         if query.cam_from_world is None:
-            return Outcome(metrics=told, estimates=estimates, notes=("its pose is withheld",))
-        errors = None if there is None else pose.compute_errors(there, query.cam_from_world)
-        return Outcome(metrics={**score_pose(errors), **told}, estimates=estimates)
+            return Outcome(metrics=counts, estimates=estimates, notes=("its pose is withheld",))
+        errors = None if cam_from_world is None else pose.compute_errors(cam_from_world, query.cam_from_world)
+        return Outcome(metrics={**score_pose(errors), **counts}, estimates=estimates)
 
     def _select_matcher(self, defense: Defense) -> str | None:
         return map_matching.select_matcher(defense) if self.matcher == "auto" else self.matcher
@@ -103,38 +105,38 @@ class Localization(Task):
 
 
 def _check_intrinsics(server: Server, secret: Features, query: str) -> None:
-    """Raise UnitError if the intrinsics are wrong; found out by raw features, so that all defenses have the same queries."""
-    known = server.scene_index.focal_mismatches
-    if query not in known:
-        known[query] = server.estimate_focal_mismatch(secret)
-    if (ratio := known[query]) is not None:
-        raise SampleError(f"{query}: its intrinsics do not fit; its raw features ask for {ratio:.2f} times the focal length")
+    """Raise SampleError if the intrinsics are wrong, judged by raw features, so that all defenses have the same queries."""
+    mismatches = server.scene_index.focal_mismatches
+    if query not in mismatches:
+        mismatches[query] = server.estimate_focal_mismatch(secret)
+    if (ratio := mismatches[query]) is not None:
+        raise SampleError(f"{query}: its intrinsics are wrong; its raw features fit {ratio:.2f} times the focal length")
 
 
 def score_pose(errors: tuple[float, float] | None) -> dict[str, float | None]:
-    """Which thresholds a pose meets, and its errors; None is a query that was not localized."""
+    """Score a pose by thresholds and errors; None is a query that was not localized."""
     translation, rotation = (None, None) if errors is None else errors
-    met = {
+    recalls = {
         f"recall_{name}": float(errors is not None and errors[0] <= length and errors[1] <= angle)
         for name, (length, angle) in THRESHOLDS.items()
     }
-    return {**met, "translation_error": translation, "rotation_error": rotation}
+    return {**recalls, "translation_error": translation, "rotation_error": rotation}
 
 
 def look_up_pairs(path: Path, query: str, names: tuple[str, ...]) -> Indices:
-    """The references that a file of pairs lists for a query.
+    """Look up the references that a file of pairs lists for a query.
 
     Raises
     ------
     UserError
-        if the file is damaged, or names a reference that the map does not have.
+        if the file is damaged, or names an image that is no reference of the map.
     """
-    places = {name: place for place, name in enumerate(names)}
+    rows = {name: row for row, name in enumerate(names)}
     wanted = pairs.read(path).get(query, [])
-    missing = [name for name in wanted if name not in places]
+    missing = [name for name in wanted if name not in rows]
     if missing:
         raise UserError(f"{path}: {missing[0]} is no reference of the map")
-    return np.array([places[name] for name in wanted], dtype=np.int64)
+    return np.array([rows[name] for name in wanted], dtype=np.int64)
 
 
 PLUGIN = Localization

@@ -1,14 +1,14 @@
-"""Matching: which keypoints of two views of a plane a server brings together, if one view or both are privatised.
+"""Matching: accuracy of a server's matches between two views of a plane, with one or both views privatised.
 
-With H the homography from the first image to the second, a match (i, j) errs by |H x_i − x_j| pixels. It is right below
-`RIGHT`, and
+With H the homography from the first image to the second, the error of a match (i, j) is |H x_i − x_j| pixels. A match is correct
+below `MAX_ERROR`, and
 
-- mean matching accuracy at t: the share of matches that err by less than t;
-- precision: the share that is right, and so the accuracy at `RIGHT`;
-- recall: of the keypoints of the first image that have a true correspondence, a keypoint of the second that errs by less than
-  `RIGHT`, the share that has a right match.
+- mean matching accuracy at t: the fraction of matches with an error below t;
+- precision: the fraction of correct matches, which is the accuracy at `MAX_ERROR`;
+- recall: among the keypoints of the first image with a true correspondence (a keypoint of the second at an error below
+  `MAX_ERROR`), the fraction with a correct match.
 
-Where nothing is matched, all are zero. (Mikolajczyk and Schmid, PAMI 2005; Dusmanu et al., CVPR 2019.)
+Without any match all are zero. (Mikolajczyk and Schmid, PAMI 2005; Dusmanu et al., CVPR 2019.)
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from bench.api import Attack, Dataset, Defense, Extractor
 from bench.codebook.public import Public
@@ -37,21 +36,21 @@ Doubles = NDArray[np.float64]
 
 MAX_ERROR = 3.0  # pixels
 ACCURACY_LIMITS = range(1, 11)  # pixels
-SEED = 0  # of the pairs that are made
+SEED = 0  # of the rendered pairs
 
 
 @dataclass(frozen=True, kw_only=True)
 class Matching(Task):
-    """How well two views of a plane are matched: views of the built-in photographs that are made here, or a folder of HPatches.
+    """How well two views of a plane are matched: rendered views of the built-in photographs, or a folder of HPatches.
 
-    The first image is privatised; the second is not, unless `both` says so.
+    The first image is privatised; the second only with `both`.
     """
 
     judges_attacks: ClassVar[bool] = False
 
-    both: bool = False  # whether the second image is privatised, too
-    ratio: float = 1.0  # of Lowe's test, for what is mutually nearest; 1 asks for nothing
-    each: int = 4  # pairs made of every built-in photograph
+    both: bool = False  # whether the second image is privatised too
+    ratio: float = 1.0  # of Lowe's test, for mutually nearest pairs; 1 disables it
+    each: int = 4  # pairs per built-in photograph
 
     def __post_init__(self) -> None:
         if not 0 < self.ratio <= 1:
@@ -86,12 +85,12 @@ class Matching(Task):
             if self.both
             else two_view_matching.prepare_unprotected(reference.secret, trial.defense, trial.public)
         )
-        found = two_view_matching.match_releases(query.release, second, self.ratio)
-        return Outcome(metrics=compute_accuracy(query.release.keypoints, second.keypoints, pair.homography, found))
+        matches = two_view_matching.match_releases(query.release, second, self.ratio)
+        return Outcome(metrics=compute_accuracy(query.release.keypoints, second.keypoints, pair.homography, matches))
 
 
 def compute_accuracy(first: Floats, second: Floats, homography: Doubles, matches: Indices) -> dict[str, float | None]:
-    """What the top of this file defines; recall is None if no keypoint has a true correspondence.
+    """Compute the metrics defined at the top of this file; recall is None if no keypoint has a true correspondence.
 
     Parameters
     ----------
@@ -99,16 +98,18 @@ def compute_accuracy(first: Floats, second: Floats, homography: Doubles, matches
     homography : (3, 3) from the first image to the second
     matches : (M, 2)
     """
+    from scipy.spatial import cKDTree
+
     expected = transfer(first, homography)  # (N, 2)
     errors = np.linalg.norm(expected[matches[:, 0]] - second[matches[:, 1]], axis=1)  # (M,)
     possible = np.zeros(len(first), dtype=bool)
-    seen = np.isfinite(expected).all(axis=1)
-    possible[seen] = cKDTree(second).query(expected[seen])[0] < MAX_ERROR
-    right = np.zeros(len(first), dtype=bool)
-    right[matches[errors < MAX_ERROR, 0]] = True
+    finite = np.isfinite(expected).all(axis=1)
+    possible[finite] = cKDTree(second).query(expected[finite])[0] < MAX_ERROR
+    correct = np.zeros(len(first), dtype=bool)
+    correct[matches[errors < MAX_ERROR, 0]] = True
     return {
         "precision": _compute_fraction(errors < MAX_ERROR),
-        "recall": float(right[possible].mean()) if possible.any() else None,
+        "recall": float(correct[possible].mean()) if possible.any() else None,
         **{f"mma_{t:02}px": _compute_fraction(errors < t) for t in ACCURACY_LIMITS},
         "matches": float(len(matches)),
         "correspondences": float(possible.sum()),
@@ -116,11 +117,11 @@ def compute_accuracy(first: Floats, second: Floats, homography: Doubles, matches
 
 
 def transfer(points: Floats, homography: Doubles) -> Doubles:
-    """Where points of the first image are in the second; infinite on and beyond the horizon. (N, 2) -> (N, 2)"""
-    lifted = np.concatenate([points, np.ones((len(points), 1))], axis=1, dtype=np.float64) @ homography.T  # (N, 3)
-    depth = np.where(lifted[:, 2:] > 0, lifted[:, 2:], 0.0)
+    """Transfer points of the first image to the second; infinite on and beyond the horizon. (N, 2) -> (N, 2)"""
+    homogeneous = np.concatenate([points, np.ones((len(points), 1))], axis=1, dtype=np.float64) @ homography.T  # (N, 3)
+    depth = np.where(homogeneous[:, 2:] > 0, homogeneous[:, 2:], 0.0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(depth > 0, lifted[:, :2] / depth, np.inf)
+        return np.where(depth > 0, homogeneous[:, :2] / depth, np.inf)
 
 
 def _compute_fraction(flags: NDArray[np.bool_]) -> float:

@@ -1,4 +1,4 @@
-"""Reconstruction: how much of the photograph an attacker paints from a release, and how near he comes to its descriptors."""
+"""Reconstruction: how well an attacker recovers the photograph and its descriptors from a release."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ from bench.threat_model import (
 )
 from bench.types import Descriptors, Floats, Points
 
-RELEASES = {OtherReleases, RepeatedReleases}  # which every defense can make
+RELEASES = {OtherReleases, RepeatedReleases}  # available for every defense
 
 
 @dataclass(frozen=True, kw_only=True)
 class Reconstruction(Task):
-    """Compares the attacker's image with the photograph, and his descriptors with the true ones.
+    """Compares the attacker's image with the photograph, and their descriptors with the true ones.
 
-    Where an attack recovers descriptors, the `inverter` paints them: the network for raw descriptors.
+    If an attack recovers descriptors, the `inverter` reconstructs the image from them: the network for raw descriptors.
     """
 
     judges_attacks = True
@@ -64,13 +64,13 @@ class Reconstruction(Task):
     def resolve(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> Mapping[str, Any]:
         if attack is None:
             return {}
-        for what, load in offer_knowledge(attack, defense, public).items():
-            if what in attack.needs:
+        for kind, load in offer_knowledge(attack, defense, public).items():
+            if kind in attack.needs:
                 load()
         digests = dict(attack.assets(defense, extractor, public))
         if isinstance(attack, ImageAttack):
             return digests
-        inverter, undefended, reason = self._inverter(extractor, public)
+        inverter, undefended, reason = self._load_inverter(extractor, public)
         if reason is not None:
             return digests | {"inversion": None}
         return digests | {
@@ -82,22 +82,22 @@ class Reconstruction(Task):
         if attack is None:
             raise SampleError("reconstruction needs an attack")
         if isinstance(attack, ImageAttack):
-            return compared(trial, None, reconstructed(attack, build_view(trial), trial))
-        found = attack_cache.recover_cached(attack, trial, build_view(trial))
-        inverter, undefended, reason = self._inverter(trial.extractor, trial.public)
+            return compute_metrics(trial, None, reconstruct_image(attack, build_view(trial), trial))
+        recovered = attack_cache.recover_cached(attack, trial, build_view(trial))
+        inverter, undefended, reason = self._load_inverter(trial.extractor, trial.public)
         if reason is not None:
-            outcome = compared(trial, found.selection, None, (*found.notes, f"no image: {reason}"))
-            return dataclasses.replace(outcome, saved_seconds=found.saved_seconds)
-        keypoints = trial.release.keypoints[found.selection.rows]
+            outcome = compute_metrics(trial, recovered.selection, None, (*recovered.notes, f"no image: {reason}"))
+            return dataclasses.replace(outcome, saved_seconds=recovered.saved_seconds)
+        keypoints = trial.release.keypoints[recovered.selection.rows]
         release = Descriptors(
-            positions=Points(keypoints=keypoints), size=trial.release.size, descriptors=found.selection.descriptors
+            positions=Points(keypoints=keypoints), size=trial.release.size, descriptors=recovered.selection.descriptors
         )
-        seen = build_view(dataclasses.replace(trial.with_release(release), attack=inverter, defense=undefended))
-        outcome = compared(trial, found.selection, reconstructed(inverter, seen, trial), found.notes)
-        return dataclasses.replace(outcome, saved_seconds=found.saved_seconds)
+        view = build_view(dataclasses.replace(trial.with_release(release), attack=inverter, defense=undefended))
+        outcome = compute_metrics(trial, recovered.selection, reconstruct_image(inverter, view, trial), recovered.notes)
+        return dataclasses.replace(outcome, saved_seconds=recovered.saved_seconds)
 
-    def _inverter(self, extractor: Extractor, public: Public) -> tuple[ImageAttack, Defense, str | None]:
-        """The attack that paints descriptors, the defense that it was made for, and why it cannot be used, if it cannot."""
+    def _load_inverter(self, extractor: Extractor, public: Public) -> tuple[ImageAttack, Defense, str | None]:
+        """Return the attack that inverts raw descriptors, its defense, and the reason if it does not apply."""
         inverter = spec.read(self.inverter, discovery.ATTACK)
         if not isinstance(inverter, ImageAttack):
             raise UserError(f"reconstruction: inverter must reconstruct images, and {inverter.name()} does not")
@@ -106,7 +106,7 @@ class Reconstruction(Task):
 
 
 def offer_knowledge(attack: Attack, defense: Defense, public: Public) -> dict[type[Knowledge], Callable[[], Knowledge]]:
-    """Return loaders of what there is to know beside the releases of that defense and the server's map."""
+    """Return loaders of all knowledge except releases of that defense and the server's map."""
     databases = fields.list_assets(defense)
     own = fields.list_assets(attack).get("database", "shipped-public")
     offers: dict[type[Knowledge], Callable[[], Knowledge]] = {
@@ -119,60 +119,59 @@ def offer_knowledge(attack: Attack, defense: Defense, public: Public) -> dict[ty
 
 
 def build_view(trial: Trial) -> View:
-    """Return all that the attack gets: copies of what was released, and of the rest only what it declared to need."""
+    """Return the attack's input: copies of the releases, and of other knowledge only what the attack declares in `needs`."""
     attack = trial.attack
     assert attack is not None
     offers = offer_knowledge(attack, trial.defense, trial.public) | {
         OtherReleases: lambda: OtherReleases(draw=lambda count: map(copy.deepcopy, trial.others(count))),
         RepeatedReleases: lambda: RepeatedReleases(releases=copy.deepcopy(trial.repeats)),
-        ServerMap: lambda: _server_map(trial),
+        ServerMap: lambda: _build_server_map(trial),
     }
     return View(
-        release=copy.deepcopy(trial.release),  # whatever the attack does to it, the next attack sees what was released
+        release=copy.deepcopy(trial.release),  # an attack cannot change what the next one gets
         defense=trial.defense,
         extractor=trial.extractor,
         knowledge={kind: load for kind, load in offers.items() if kind in attack.needs},
     )
 
 
-def _server_map(trial: Trial) -> ServerMap:
+def _build_server_map(trial: Trial) -> ServerMap:
     from bench.localization.server import Server  # it imports COLMAP
 
     return ServerMap(server=Server(public=trial.public, camera=trial.sample.subject.camera))
 
 
-def reconstructed(attack: ImageAttack, seen: View, trial: Trial) -> Floats:
-    """The attacker's image. -> (H, W, 3)"""
+def reconstruct_image(attack: ImageAttack, view: View, trial: Trial) -> Floats:
+    """Run the attack and check its image. -> (H, W, 3)"""
     with wrap_plugin_errors(f"plugin {attack.name()}"):
-        image: Floats = trial.execute(attack.reconstruct, seen, trial.rng)
-        width, height = seen.release.size
+        image: Floats = trial.execute(attack.reconstruct, view, trial.rng)
+        width, height = view.release.size
         attack_cache.check_array(image, (height, width, 3))
         if image.min() < 0 or image.max() > 1:
             raise ValueError(f"returned values from {image.min()} to {image.max()}, expected 0 to 1")
     return image
 
 
-def compared(trial: Trial, found: Selection | None, image: Floats | None, notes: tuple[str, ...] = ()) -> Outcome:
-    """Every metric of what was recovered; None for a metric of what was not. Of an image with a foreground, its parts as well."""
+def compute_metrics(trial: Trial, selection: Selection | None, image: Floats | None, notes: tuple[str, ...] = ()) -> Outcome:
+    """Compute every metric of the image and the descriptors; None where one is missing. With a foreground, its parts as well."""
     values: dict[str, float | None] = {}
     truth = (trial.pixels() / 255.0).astype(np.float32)
     for metric in trial.metrics:
         if metric.compares == "images":
-            values[metric.name()] = None if image is None else _measured(metric, truth, image)
+            values[metric.name()] = None if image is None else _compute_metric(metric, truth, image)
         else:
-            described = (
+            values[metric.name()] = (
                 None
-                if found is None or len(found.rows) == 0
-                else _measured(metric, trial.secret.descriptors[found.rows], found.descriptors)
+                if selection is None or len(selection.rows) == 0
+                else _compute_metric(metric, trial.secret.descriptors[selection.rows], selection.descriptors)
             )
-            values[metric.name()] = described
     if image is not None and (mask := trial.images[0].foreground()) is not None:
-        values |= parts(trial.metrics, truth, image, mask)
+        values |= compute_part_metrics(trial.metrics, truth, image, mask)
     return Outcome(metrics=values, image=image, notes=notes)
 
 
-def parts(metrics: Sequence[Metric], truth: Floats, image: Floats, mask: Mask) -> dict[str, float | None]:
-    """Those metrics that can be told for each pixel, over the foreground and over the rest; None for an empty part."""
+def compute_part_metrics(metrics: Sequence[Metric], truth: Floats, image: Floats, mask: Mask) -> dict[str, float | None]:
+    """Compute each per-pixel metric over the foreground and over the background; None for an empty part."""
     values: dict[str, float | None] = {}
     for metric in metrics:
         if isinstance(metric, LocalMetric):
@@ -183,7 +182,7 @@ def parts(metrics: Sequence[Metric], truth: Floats, image: Floats, mask: Mask) -
     return values
 
 
-def _measured(metric: Metric, truth: Floats, estimate: Floats) -> float | None:
+def _compute_metric(metric: Metric, truth: Floats, estimate: Floats) -> float | None:
     with wrap_plugin_errors(f"plugin {metric.name()}"):
         value = metric(truth, estimate)
         if value is not None and not np.isfinite(value):

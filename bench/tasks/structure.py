@@ -1,7 +1,7 @@
-"""Structure from motion: the model that a server makes of a place from nothing but releases (the paper's supplement, Table S2).
+"""Structure from motion: the model that a server builds of a scene from releases alone (the paper's supplement, Table S2).
 
 All images are privatised. Two keypoints match by a word that both images release and that is unique in each, by mutually
-nearest descriptors, or by mutually nearest subspaces. Pairs of images are verified and mapped as `bench/sfm/` says.
+nearest descriptors, or by mutually nearest subspaces. `bench/sfm/` verifies the pairs of images and builds the model.
 """
 
 from __future__ import annotations
@@ -9,10 +9,9 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-import pycolmap
 
 from bench.api import Attack, Dataset, Defense, Extractor
 from bench.codebook.public import Public
@@ -27,19 +26,22 @@ from bench.sfm.incremental_mapping import Mapper, Model
 from bench.task_api import Outcome, Task, Trial
 from bench.types import Descriptors, Release, Subspaces, WordSets
 
+if TYPE_CHECKING:
+    import pycolmap
+
 
 @dataclass(frozen=True, kw_only=True)
 class Structure(Task):
-    """How much of a place structure from motion rebuilds from releases: of its queries, as their poses are sought.
+    """How much of a scene structure from motion reconstructs from releases of its queries.
 
-    The references, if there are any, serve for the dictionary alone.
+    References, if there are any, are used for the dictionary alone.
     """
 
     judges_attacks: ClassVar[bool] = False
     needs_scene: ClassVar[bool] = True
 
-    images: int = 25  # the first queries of the place, at most
-    ratio: float = 0.8  # of Lowe's test among descriptors; 1 asks for nothing
+    images: int = 25  # the first queries of the scene, at most
+    ratio: float = 0.8  # of Lowe's test among descriptors; 1 disables it
     mapper: Mapper = "global"
 
     def __post_init__(self) -> None:
@@ -52,19 +54,19 @@ class Structure(Task):
 
     def collect(self, images: Images, dataset: Dataset | None) -> Collection:
         if images is not None:
-            raise UserError(
-                "structure is about a place and takes no images; give --dataset, such as captured:path=DIR,leading=25"
-            )
+            raise UserError("structure takes a dataset and no images; give --dataset, such as captured:path=DIR,leading=25")
         scene = (dataset or Walk()).scene()
-        chosen = scene.queries[: self.images]
-        if len(chosen) < incremental_mapping.MIN_IMAGES:
-            raise UserError(f"{scene.name}: {len(chosen)} queries, of which nothing can be rebuilt")
-        for image in chosen:
-            if _intrinsics_key(image.camera) != _intrinsics_key(chosen[0].camera):
-                raise UserError(f"{scene.name}: {chosen[0].name} and {image.name} are of different cameras; structure takes one")
-        unit = Sample(name=scene.name, images=tuple(image.pixels for image in chosen), subject=chosen)
+        queries = scene.queries[: self.images]
+        if len(queries) < incremental_mapping.MIN_IMAGES:
+            raise UserError(f"{scene.name}: {len(queries)} queries; structure needs at least {incremental_mapping.MIN_IMAGES}")
+        for image in queries:
+            if _intrinsics_key(image.camera) != _intrinsics_key(queries[0].camera):
+                raise UserError(
+                    f"{scene.name}: {queries[0].name} and {image.name} have different cameras; structure needs one camera"
+                )
+        sample = Sample(name=scene.name, images=tuple(image.pixels for image in queries), subject=queries)
         return Collection(
-            name=scene.name, samples=(unit,), scene=scene, extra_inputs={"scene": samples.hash_scene_images(chosen)}
+            name=scene.name, samples=(sample,), scene=scene, extra_inputs={"scene": samples.hash_scene_images(queries)}
         )
 
     def explain_not_applicable(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> str | None:
@@ -80,23 +82,23 @@ class Structure(Task):
         releases = [shot.release for shot in trial.images]
         keypoints = [release.keypoints for release in releases]
         camera, seed = images[0].camera, int(trial.rng.integers(2**31))
-        found = {(a, b): self._match(releases[a], releases[b]) for a, b in itertools.combinations(range(len(releases)), 2)}
-        geometries = verification.verify_pairs(camera, keypoints, found, seed)
+        matches = {(a, b): self._match(releases[a], releases[b]) for a, b in itertools.combinations(range(len(releases)), 2)}
+        geometries = verification.verify_pairs(camera, keypoints, matches, seed)
         model = incremental_mapping.build_model(camera, keypoints, geometries, self.mapper, seed)
-        told = {
+        counts = {
             "images": float(len(images)),
-            "tried_matches": float(np.mean([len(pairs) for pairs in found.values()])),
+            "tried_matches": float(np.mean([len(pairs) for pairs in matches.values()])),
             "verified_pairs": float(len(geometries)),
             "verified_matches": float(sum(len(geometry.matches) for geometry in geometries.values())),
         }
         return Outcome(
-            metrics={**compute_metrics(model, [image.cam_from_world for image in images]), **told},
+            metrics={**compute_metrics(model, [image.cam_from_world for image in images]), **counts},
             image=None if model is None else picture.draw_from_above(model),
         )
 
     def _match(self, first: Release, second: Release) -> np.ndarray:
         try:
-            # Subspaces are as far from their second nearest as from their nearest, nearly: the ratio would tell nothing.
+            # No ratio test for subspaces: their nearest and second nearest are about equally far away.
             ratio = 1.0 if isinstance(first, Subspaces) else self.ratio
             return two_view_matching.match_releases(first, second, ratio, unique=True)
         except TypeError as error:
@@ -104,28 +106,28 @@ class Structure(Task):
 
 
 def compute_metrics(model: Model | None, truth: Sequence[pycolmap.Rigid3d | None]) -> dict[str, float | None]:
-    """The paper's four measures, and how many images are where they were taken; None where poses are withheld.
+    """Compute the paper's four measures, and the number of images with the right pose; None where poses are withheld.
 
     Parameters
     ----------
     model : None if there is none
     truth : cam_from_world of every image
     """
-    known = [pose for pose in truth if pose is not None]
+    poses = [pose for pose in truth if pose is not None]
     if model is None:
         return {
             "registered": 0.0,
             "points": 0.0,
             "track_length": None,
             "reprojection_error": None,
-            "right_poses": 0.0 if len(known) == len(truth) else None,
+            "right_poses": 0.0 if len(poses) == len(truth) else None,
         }
     return {
         "registered": float(len(model.images)),
         "points": float(len(model.points)),
         "track_length": model.track_length,
         "reprojection_error": model.reprojection_error,
-        "right_poses": float(agreement.count_correct_poses(model, known)) if len(known) == len(truth) else None,
+        "right_poses": float(agreement.count_correct_poses(model, poses)) if len(poses) == len(truth) else None,
     }
 
 

@@ -21,7 +21,7 @@ from leaderboard import localization_results
 from leaderboard.reproduce import figures, page, run, tables
 from leaderboard.reproduce.drawing import Drawing, FigureData, save
 from leaderboard.reproduce.profiles import Materials, Setting, find_profile
-from leaderboard.reproduce.run import TestSet
+from leaderboard.reproduce.run import EvaluationSet
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -69,23 +69,27 @@ def reproduce(
     if not needs_dataset and dataset is not None:
         raise UserError(f"{name} uses photographs: pass them with --images, not --dataset")
     if needs_dataset:
-        test_set = run.select_queries(dataset or (table.dataset(profile) if table and table.dataset else profile.figure_gallery))
+        evaluation_set = run.select_queries(
+            dataset or (table.dataset(profile) if table and table.dataset else profile.figure_gallery)
+        )
     else:
-        test_set = run.select_photographs(images, profile, profile.figure_photographs if name == FIGURES else profile.photographs)
+        evaluation_set = run.select_photographs(
+            images, profile, profile.figure_photographs if name == FIGURES else profile.photographs
+        )
     setting = Setting(
         profile=profile,
         materials=Materials(**{field: Asset(file) for field, file in materials.items()}),
         extractor=extractor or (table.extractor(profile) if table else Sift()),
-        photographs=len(test_set.photographs),
+        photographs=len(evaluation_set.photographs),
         seed=seed,
     )
-    folder = out or Path("runs") / f"reproduce-{profile.name}-{_name_folder(images, test_set)}"
+    folder = out or Path("runs") / f"reproduce-{profile.name}-{_name_folder(images, evaluation_set)}"
     engine = engines.choose_engine(workers or (threads.count_cores() if needs_dataset else 1))
     if table is None:
-        return _reproduce_figures(name, drawings[name], setting, test_set, folder, engine)
-    reproduced = run.reproduce_table(table, setting, test_set, folder, engine)
+        return _reproduce_figures(name, drawings[name], setting, evaluation_set, folder, engine)
+    reproduced = run.reproduce_table(table, setting, evaluation_set, folder, engine)
     page.write(reproduced, folder)
-    data = FigureData(setting=setting, test_set=test_set, result=reproduced.result, out=folder)
+    data = FigureData(setting=setting, evaluation_set=evaluation_set, result=reproduced.result, out=folder)
     records = (record for group in reproduced.result.records.values() for record in group)
     files = [Text(line) for line in localization_results.write(records, folder)]
     files += [] if table.draw is None else _save_figures(name, table.draw(data), folder)
@@ -105,19 +109,19 @@ def takes_dataset(name: str) -> bool:
     return any(drawing.uses_queries for drawing in group_drawings()[name]) if table is None else table.dataset is not None
 
 
-def _name_folder(images: Path | None, test_set: TestSet) -> str:
-    if test_set.dataset is not None:
-        return test_set.dataset.name()
+def _name_folder(images: Path | None, evaluation_set: EvaluationSet) -> str:
+    if evaluation_set.dataset is not None:
+        return evaluation_set.dataset.name()
     return "builtin" if images is None else images.resolve().name
 
 
 def _reproduce_figures(
-    name: str, drawings: tuple[Drawing, ...], setting: Setting, test_set: TestSet, out: Path, engine: Engine
+    name: str, drawings: tuple[Drawing, ...], setting: Setting, evaluation_set: EvaluationSet, out: Path, engine: Engine
 ) -> Reproduction:
     """Run the rows of the figures, and draw them into `out`/figures."""
     rows = {row.name: row for drawing in drawings for row in drawing.build_rows(setting)}
-    result = run.run_rows(list(rows.values()), setting, test_set, out, name, engine)
-    data = FigureData(setting=setting, test_set=test_set, result=result, out=out)
+    result = run.run_rows(list(rows.values()), setting, evaluation_set, out, name, engine)
+    data = FigureData(setting=setting, evaluation_set=evaluation_set, result=result, out=out)
     files = [file for drawing in drawings for file in _save_figures(drawing.name, drawing.draw(data), out)]
     return Reproduction(out=out, output=tuple(files), failed=run.count_failures(result))
 

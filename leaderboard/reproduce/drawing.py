@@ -17,7 +17,7 @@ from bench.runner.directory import reconstruction_path
 from bench.types import Bytes
 from leaderboard.figures import Panel
 from leaderboard.reproduce.profiles import Setting
-from leaderboard.reproduce.run import RunResult, TestSet, select_records
+from leaderboard.reproduce.run import EvaluationSet, RunResult, select_records
 from leaderboard.reproduce.study import Row
 
 if TYPE_CHECKING:
@@ -34,13 +34,13 @@ class FigureData:
     """The input of a figure."""
 
     setting: Setting
-    test_set: TestSet
+    evaluation_set: EvaluationSet
     result: RunResult
     out: Path
 
     def load_originals(self) -> Iterator[tuple[str, Bytes]]:
         """Yield the names of the readable samples, and their pixels."""
-        for sample in self.test_set.samples:
+        for sample in self.evaluation_set.samples:
             with contextlib.suppress(SampleError):
                 yield sample.name, samples.read_pixels(sample.images[0])[0]
 

@@ -54,14 +54,13 @@ def write(table: ReproducedTable, out: Path) -> list[Path]:
 
 def format_heading(table: ReproducedTable) -> str:
     """Return the title with profile, samples, features and seeds."""
-    test_set, setting = table.test_set, table.setting
-    count, features = len(test_set.names), label_extractor(spec.to_json(setting.extractor))
-    of_all = "" if count == test_set.available else f" of {test_set.available}"
+    evaluation_set, setting = table.evaluation_set, table.setting
+    count, features = len(evaluation_set.names), label_extractor(spec.to_json(setting.extractor))
+    of_all = "" if count == evaluation_set.available else f" of {evaluation_set.available}"
     first, *more = run.list_seeds(table.definition, setting)
     seeds = f"seeds {first} to {more[-1]}" if more else f"seed {first}"
-    return (
-        f"{table.definition.title}; profile {setting.profile.name}, {count}{of_all} {test_set.name}, {features} features, {seeds}"
-    )
+    samples = f"{count}{of_all} {evaluation_set.name}"
+    return f"{table.definition.title}; profile {setting.profile.name}, {samples}, {features} features, {seeds}"
 
 
 def to_markdown(table: ReproducedTable) -> str:
@@ -161,8 +160,12 @@ def to_json(table: ReproducedTable) -> dict[str, Any]:
         "title": table.definition.title,
         "profile": setting.profile.name,
         "scale": setting.profile.scale,
-        "units": {"of": table.test_set.name, "names": list(table.test_set.names), "available": table.test_set.available},
-        "dataset": None if table.test_set.dataset is None else spec.to_json(table.test_set.dataset),
+        "units": {
+            "of": table.evaluation_set.name,
+            "names": list(table.evaluation_set.names),
+            "available": table.evaluation_set.available,
+        },
+        "dataset": None if table.evaluation_set.dataset is None else spec.to_json(table.evaluation_set.dataset),
         "extractor": spec.to_json(setting.extractor),
         "seeds": list(run.list_seeds(table.definition, setting)),
         "rows": [_row_to_json(row, table) for row in table.result.rows],

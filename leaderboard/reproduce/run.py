@@ -28,7 +28,7 @@ from leaderboard.reproduce.study import Measure, Row, Table
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class TestSet:
+class EvaluationSet:
     """The samples of a reproduction: photographs, or the queries or all images of a scene."""
 
     name: str  # a description in the plural
@@ -60,7 +60,7 @@ class ReproducedTable:
 
     definition: Table
     setting: Setting
-    test_set: TestSet
+    evaluation_set: EvaluationSet
     result: RunResult
     ours: Mapping[TableEntry, Interval]  # entries with values only
     notes: Mapping[str, str]  # row's name -> why it has no values, or remarks on them
@@ -68,7 +68,7 @@ class ReproducedTable:
     claim_results: tuple[ClaimResult, ...]
 
 
-def select_photographs(images: Path | None, profile: Profile, limit: int) -> TestSet:
+def select_photographs(images: Path | None, profile: Profile, limit: int) -> EvaluationSet:
     """Return the first `limit` photographs of a folder, or of the profile's built-in ones for None.
 
     Raises
@@ -78,16 +78,18 @@ def select_photographs(images: Path | None, profile: Profile, limit: int) -> Tes
     """
     if images is None:
         sources = [source for source in photographs.list_builtin() if profile.builtin is None or source.name in profile.builtin]
-        return _build_test_set("built-in photographs", sources, limit)
-    return _build_test_set(f"photographs of {images.resolve().name}", photographs.list_photographs(images), limit)
+        return _build_evaluation_set("built-in photographs", sources, limit)
+    return _build_evaluation_set(f"photographs of {images.resolve().name}", photographs.list_photographs(images), limit)
 
 
-def _build_test_set(name: str, sources: Sequence[Source], limit: int) -> TestSet:
+def _build_evaluation_set(name: str, sources: Sequence[Source], limit: int) -> EvaluationSet:
     selection = tuple(sources[:limit])
-    return TestSet(name=name, names=tuple(source.name for source in selection), available=len(sources), photographs=selection)
+    return EvaluationSet(
+        name=name, names=tuple(source.name for source in selection), available=len(sources), photographs=selection
+    )
 
 
-def select_queries(dataset: Dataset) -> TestSet:
+def select_queries(dataset: Dataset) -> EvaluationSet:
     """Return all queries of a dataset.
 
     Raises
@@ -97,10 +99,12 @@ def select_queries(dataset: Dataset) -> TestSet:
     """
     scene = dataset.scene()
     names = tuple(query.name for query in scene.queries)
-    return TestSet(name=f"queries of {scene.name}", names=names, available=len(names), dataset=dataset)
+    return EvaluationSet(name=f"queries of {scene.name}", names=names, available=len(names), dataset=dataset)
 
 
-def reproduce_table(table: Table, setting: Setting, test_set: TestSet, out: Path, engine: Engine = IN_PROCESS) -> ReproducedTable:
+def reproduce_table(
+    table: Table, setting: Setting, evaluation_set: EvaluationSet, out: Path, engine: Engine = IN_PROCESS
+) -> ReproducedTable:
     """Run the rows that `out` has no records of, and evaluate the claims.
 
     Raises
@@ -109,8 +113,8 @@ def reproduce_table(table: Table, setting: Setting, test_set: TestSet, out: Path
         if a file is missing or does not fit; nothing is written then.
     """
     rows = (*table.build_rows(setting), *table.build_reference_rows(setting))
-    result = run_rows(rows, setting, test_set, out, table.name, engine, list_seeds(table, setting))
-    return compare_with_paper(table, setting, test_set, result)
+    result = run_rows(rows, setting, evaluation_set, out, table.name, engine, list_seeds(table, setting))
+    return compare_with_paper(table, setting, evaluation_set, result)
 
 
 def list_seeds(table: Table, setting: Setting) -> range:
@@ -121,7 +125,7 @@ def list_seeds(table: Table, setting: Setting) -> range:
 def run_rows(
     rows: Sequence[Row],
     setting: Setting,
-    test_set: TestSet,
+    evaluation_set: EvaluationSet,
     out: Path,
     title: str,
     engine: Engine = IN_PROCESS,
@@ -133,13 +137,15 @@ def run_rows(
     """
     tasks = dict.fromkeys(row.task for row in rows)
     plans = [
-        _plan_task(task, rows, setting, test_set, seed)
+        _plan_task(task, rows, setting, evaluation_set, seed)
         for seed in ((setting.seed,) if seeds is None else seeds)
         for task in tasks
     ]
     experiment_ids = {row.name: _list_experiment_ids(row, plans) for row in rows}
     unordered: list[Record] = []
-    with Progress(f"{title}: {len(test_set.names)} {test_set.name}, {len(rows)} rows", sum(map(len, plans))) as progress:
+    with Progress(
+        f"{title}: {len(evaluation_set.names)} {evaluation_set.name}, {len(rows)} rows", sum(map(len, plans))
+    ) as progress:
         for record in execute(plans, out, engine):
             unordered.append(record)
             progress.advance(note=record["sample"])
@@ -153,7 +159,7 @@ def run_rows(
     )
 
 
-def compare_with_paper(table: Table, setting: Setting, test_set: TestSet, result: RunResult) -> ReproducedTable:
+def compare_with_paper(table: Table, setting: Setting, evaluation_set: EvaluationSet, result: RunResult) -> ReproducedTable:
     """Return means, intervals, rank correlation and verdicts, computed from records alone."""
     reasons = {row.name: reason for row in result.rows if (reason := _explain_missing(select_records(result, row.name)))}
     columns = _collect_values(table, result)
@@ -162,7 +168,7 @@ def compare_with_paper(table: Table, setting: Setting, test_set: TestSet, result
     return ReproducedTable(
         definition=table,
         setting=setting,
-        test_set=test_set,
+        evaluation_set=evaluation_set,
         result=result,
         ours=ours,
         notes={row.name: reasons.get(row.name) or _summarize_notes(select_records(result, row.name)) for row in result.rows},
@@ -193,16 +199,16 @@ def _compute_interval(measure: Measure, column: pd.Series) -> Interval:
     return proportion(column / measure.factor, measure.factor) if measure.fraction else interval(column)
 
 
-def _plan_task(task: Task, rows: Sequence[Row], setting: Setting, test_set: TestSet, seed: int) -> Plan:
+def _plan_task(task: Task, rows: Sequence[Row], setting: Setting, evaluation_set: EvaluationSet, seed: int) -> Plan:
     pairs = [(row.defense, row.attack) for row in rows if row.task == task]
     defenses = list(dict.fromkeys(defense for defense, _ in pairs))
     pairs.sort(key=lambda pair: defenses.index(pair[0]))  # so that each defense protects each photograph once
     configuration = RunConfiguration(
         pairs=tuple(pairs),
-        images=test_set.photographs or None,
+        images=evaluation_set.photographs or None,
         task=task,
         extractor=setting.extractor,
-        dataset=test_set.dataset,
+        dataset=evaluation_set.dataset,
         seed=seed,
     )
     plan = build_plan(configuration)

@@ -71,7 +71,9 @@ class Scale:
 
         values = MaxNLocator(TICKS, steps=[1, 2, 5, 10]).tick_values(self.low, self.high)
         decimals = max(0, -math.floor(math.log10(values[1] - values[0]) + 1e-9))
-        return tuple(Tick(position=self(value), text=f"{value:.{decimals}f}") for value in values if self.low <= value <= self.high)
+        return tuple(
+            Tick(position=self(value), text=f"{value:.{decimals}f}") for value in values if self.low <= value <= self.high
+        )
 
 
 def build_charts(tradeoffs: Sequence[Tradeoff]) -> list[Chart]:

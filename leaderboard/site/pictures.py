@@ -15,8 +15,8 @@ from bench.core.errors import SampleError
 from bench.images import photographs
 from bench.images.photographs import Source
 from bench.runner import directory
+from bench.runner.directory import photograph_path
 from bench.runner.records import Record
-from leaderboard import run_report
 from leaderboard.comparison import LocatedRecord
 
 FOLDER = "pictures"
@@ -37,7 +37,7 @@ def write_pairs(records: Iterable[LocatedRecord], out: Path) -> Iterator[tuple[R
         folder, record = located.folder, located.record
         reconstruction = _copy_picture(folder, directory.reconstruction_path(folder, record), out)
         if reconstruction is not None:
-            original = _copy_picture(folder, run_report.photograph_path(folder, record), out) or _write_builtin(record, out)
+            original = _copy_picture(folder, photograph_path(folder, record), out) or _write_builtin(record, out)
             yield record, Pair(reconstruction=reconstruction, original=original)
 
 

@@ -59,7 +59,7 @@ def write(results: Sequence[Path], out: Path) -> WrittenSite:
     except OSError as error:
         raise UserError(f"--out: cannot write {out}: {error.strerror}") from error
     count = sum(len(group.experiments) for group in groups)
-    with Progress(f"{len(groups)} boards, {count} cells", count) as progress:
+    with Progress(f"{len(groups)} groups, {count} experiments", count) as progress:
         lookup = functools.cache(recipe.find_plugin)
         views = [_write_group(group, groups, out, progress, lookup) for group in groups]
     page = out / PAGE
@@ -100,7 +100,9 @@ def _write_tables(table: Table, name: str, out: Path) -> dict[str, str]:
 
 
 def _write_plot(name: str, kind: str, figure: Figure, out: Path) -> dict[str, Any]:
-    files = {path.suffix[1:]: path.relative_to(out).as_posix() for path in save(figure, out / "plots" / f"{name}-{_slugify(kind)}")}
+    files = {
+        path.suffix[1:]: path.relative_to(out).as_posix() for path in save(figure, out / "plots" / f"{name}-{_slugify(kind)}")
+    }
     return files | {"name": kind.replace("-", ", "), "interactive": kind.startswith(plots.TRADEOFF)}
 
 

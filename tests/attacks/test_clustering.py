@@ -57,6 +57,7 @@ def test_clustering_finds_the_descriptor_with_releases_that_share_the_words(priv
     assert attack_succeeds(attack, private, release_others(private)).mean() > 0.8
 
 
+@pytest.mark.slow
 def test_clustering_is_at_chance_if_no_release_shares_a_word(private, public_words, tmp_path):
     """Negative control: each descriptor alone, so that its photograph has no other subspaces, and releases of another W."""
     attack = Clustering(database=public_words, neighbours=9, coverage=1.0)

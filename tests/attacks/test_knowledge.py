@@ -17,7 +17,7 @@ from bench.runner.other_releases import ReleasePool
 from bench.settings import Asset
 from bench.task_api import Trial
 from bench.tasks.reconstruction import RELEASES, Reconstruction, build_view
-from bench.testing import NO_SAMPLE, shot
+from bench.testing import EMPTY_SAMPLE, build_image
 from bench.threat_model import DefenseDatabase, OtherReleases, PublicDatabase, RepeatedReleases
 from bench.types import Features, Floats, Release, Subspaces
 from defenses.affine import Affine
@@ -45,31 +45,31 @@ def secret() -> Features:
     return found.take(np.sort(np.random.default_rng(0).choice(len(found), KEYPOINTS, replace=False)))
 
 
-def trial(attack: Attack, defense: Affine | LDP, secret: Features, others: int | None = None) -> Trial:
-    """An attack on one release; `others` limits how many releases of other photographs there are."""
+def build_trial(attack: Attack, defense: Affine | LDP, secret: Features, others: int | None = None) -> Trial:
+    """Build a trial of an attack on one release; `others` limits how many releases of other photographs there are."""
     public = Public()
-    population = ReleasePool(photographs.list_builtin()[1:4], Sift(max_keypoints=400), defense, public, derive_generator)
+    pool = ReleasePool(photographs.list_builtin()[1:4], Sift(max_keypoints=400), defense, public, derive_generator)
 
-    def strangers(count: int) -> Iterator[Release]:
-        return population.without("astronaut")(count if others is None else min(count, others))
+    def draw_others(count: int) -> Iterator[Release]:
+        return pool.without("astronaut")(count if others is None else min(count, others))
 
     return Trial(
-        sample=NO_SAMPLE,
-        images=(shot(secret, defense.protect(secret, public, np.random.default_rng(1))),),
+        sample=EMPTY_SAMPLE,
+        images=(build_image(secret, defense.protect(secret, public, np.random.default_rng(1))),),
         defense=defense,
         attack=attack,
         extractor=Sift(),
         public=public,
         metrics=(),
         rng=np.random.default_rng(2),
-        others=strangers,
+        others=draw_others,
         repeats=tuple(defense.protect(secret, public, np.random.default_rng([3, turn])) for turn in range(attack.repeats())),
     )
 
 
-def estimate(carried_out: Trial) -> Floats:
-    assert isinstance(carried_out.attack, DescriptorAttack)
-    return carried_out.attack.recover(build_view(carried_out), np.random.default_rng(4))
+def estimate(trial: Trial) -> Floats:
+    assert isinstance(trial.attack, DescriptorAttack)
+    return trial.attack.recover(build_view(trial), np.random.default_rng(4))
 
 
 def measure_angles(truth: Floats, found: Floats) -> Floats:
@@ -94,12 +94,13 @@ def list_subspace_attacks() -> list[type[Attack]]:
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("plugin", list_subspace_attacks(), ids=lambda plugin: plugin.name())
 def test_the_random_basis_has_no_effect(plugin, database, secret):
     defense = Affine(dim=4, database=database, sub_databases=SUB_DATABASES)
     attack = spec.build(plugin, {})
     assert Reconstruction().explain_not_applicable(defense, attack, Sift(), Public()) is None
-    first = trial(attack, defense, secret)
+    first = build_trial(attack, defense, secret)
     rng = np.random.default_rng(5)
     repeats = tuple(reparameterise(release, rng) for release in first.repeats)
     second = dataclasses.replace(first.with_release(reparameterise(first.release, rng)), repeats=repeats)
@@ -113,11 +114,11 @@ def test_the_random_basis_has_no_effect(plugin, database, secret):
 
 def compare_knowledge(attack: Attack, secret: Features, defense: Affine | LDP) -> tuple[Floats, Floats]:
     """Return angles to the truth with all knowledge of the attack, and with less of it."""
-    full = trial(attack, defense, secret)
+    full = build_trial(attack, defense, secret)
     if RepeatedReleases in attack.needs:
-        poor = trial(dataclasses.replace(attack, releases=1), defense, secret)
+        poor = build_trial(dataclasses.replace(attack, releases=1), defense, secret)
     elif OtherReleases in attack.needs:
-        poor = trial(attack, defense, secret, others=0)
+        poor = build_trial(attack, defense, secret, others=0)
     else:
         poor = full
     seen = build_view(poor)
@@ -138,6 +139,7 @@ WITH_KNOWLEDGE = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("plugin", WITH_KNOWLEDGE, ids=lambda plugin: plugin.name())
 def test_less_knowledge_does_not_help(plugin, database, secret):
     attack = spec.build(plugin, {})

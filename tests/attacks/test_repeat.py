@@ -211,6 +211,7 @@ def test_it_requests_the_declared_number_of_releases():
         Repeat(releases=0)
 
 
+@pytest.mark.slow
 def test_curve():
     curve = multi_release.build_rows(10.0, 256_000, 2, 10)
     assert [row["releases"] for row in curve] == list(range(1, 11))

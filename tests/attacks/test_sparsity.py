@@ -37,6 +37,7 @@ def never_stop(x):
     return x[:, 0] > 2
 
 
+@pytest.mark.slow
 def test_finds_every_degenerate_vertex_of_planes(rng):
     """Planes through two sparse vectors each, and all intersections of two of their lines x_i = 0."""
     length, total = 20, 0
@@ -90,6 +91,7 @@ def test_agrees_with_highs(rng, dim):
         assert np.linalg.norm(mine - theirs) < EXACT
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("dim", "fraction"), [(2, 0.9), (8, 0.5)])
 def test_recovers_sift(tmp_path: Path, rng, dim, fraction):
     secret = extract_sift(150)
@@ -109,6 +111,7 @@ def test_recovers_sift(tmp_path: Path, rng, dim, fraction):
     )
 
 
+@pytest.mark.slow
 def test_the_random_basis_has_no_effect(tmp_path: Path, rng):
     secret = extract_sift(100)
     release = lift_features(secret, tmp_path, draw_centres(640), dim=4)
@@ -143,6 +146,7 @@ def test_the_order_of_components_has_no_effect(tmp_path: Path, rng):
 # ---- controls
 
 
+@pytest.mark.slow
 def test_control_a_descriptor_without_zeros_is_not_certified(tmp_path: Path, rng):
     secret = build_features(rng.integers(1, 150, (60, 128), dtype=np.uint8))
     release = lift_features(secret, tmp_path, draw_centres(640), dim=2)

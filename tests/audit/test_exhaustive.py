@@ -1,4 +1,4 @@
-"""Laws by playing all courses of draws, against laws that are known."""
+"""Laws from all sequences of draws, against known laws."""
 
 import itertools
 import math
@@ -33,7 +33,7 @@ def test_arrays_choices_and_permutations() -> None:
     assert pairs == dict.fromkeys(itertools.permutations((5, 6, 7), 2), Fraction(1, 6))
 
 
-def test_draws_from_many_ranges_at_once() -> None:
+def test_draws_from_several_ranges() -> None:
     found = compute_law(lambda rng: tuple(rng.integers(np.array([2, 3])).tolist())).chances
     assert found == dict.fromkeys(itertools.product(range(2), range(3)), Fraction(1, 6))
     dice = compute_law(lambda rng: tuple(rng.integers(1, np.array([[2], [2]]), endpoint=True).ravel().tolist())).chances
@@ -48,7 +48,7 @@ def test_doubles_are_exact() -> None:
     assert sum(found.chances.values()) == 1
 
 
-def test_several_thresholds_and_what_follows_them() -> None:
+def test_several_thresholds_and_further_draws() -> None:
     def mechanism(rng: np.random.Generator) -> Any:
         x = rng.random()
         return "low" if x < 0.25 else int(rng.integers(3)) if x < 0.75 else "high"
@@ -60,9 +60,10 @@ def test_several_thresholds_and_what_follows_them() -> None:
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("domain", "size", "epsilon"), [(4, 2, 2.0), (3, 1, 1.0), (4, 3, 0.5), (4, 2, 0.0)])
 def test_the_sampler_has_the_law_of_the_theorem(domain: int, size: int, epsilon: float) -> None:
-    """Drawn word by word, or without repetition: to within 2^-58, as the digits of p are."""
+    """Both kinds of draws, to within 2^-58, like the digits of p."""
     p = Fraction(chance_digits(epsilon, domain, size, 128), 2**128)
     for true in range(domain):
         found = compute_law(
@@ -79,31 +80,32 @@ def test_greatest_ratio() -> None:
     laws = [Law({"a": Fraction(1, 2), "b": Fraction(1, 2)}), Law({"a": Fraction(1, 8), "b": Fraction(7, 8)})]
     assert bound_greatest_ratio(laws) == (4, 4)
     open_laws = [Law({"a": Fraction(3, 4)}, Fraction(1, 4)), Law({"a": Fraction(1, 2), "b": Fraction(1, 2)})]
-    assert bound_greatest_ratio(open_laws) == (2, None)  # b has at most 1/4 under the first, and perhaps nothing
+    assert bound_greatest_ratio(open_laws) == (2, None)  # b has between 0 and 1/4 under the first
     certain = [Law({"a": Fraction(1)}), Law({"b": Fraction(1)})]
     assert bound_greatest_ratio(certain) == (None, None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("mechanism", "reason"),
     [
         (lambda rng: rng.normal(), r"rng\.normal"),
         (lambda rng: rng.choice(2, p=[0.2, 0.8]), "weights"),
         (lambda rng: rng.integers(np.array([2, 3]), size=2), "many ranges"),
-        (lambda rng: tuple(rng.integers(10, size=9).tolist()), "too many courses"),
+        (lambda rng: tuple(rng.integers(10, size=9).tolist()), "too many sequences"),
         (lambda rng: int(rng.integers(2**40)) % 2, "thresholds"),
         (
             lambda rng: 0.2 < rng.random() < 0.8,
             "thresholds",
-        ),  # one would do: a draw's ends lead to one law, its middle to another
+        ),  # its range has the same law at both ends and another in the middle
     ],
 )
-def test_what_cannot_be_enumerated_is_not(mechanism: Any, reason: str) -> None:
+def test_unsupported_functions_are_refused(mechanism: Any, reason: str) -> None:
     with pytest.raises(NotEnumerableError, match=reason):
         compute_law(mechanism, 5000)
 
 
-def test_a_function_that_catches_everything_is_played_to_its_end() -> None:
+def test_a_function_that_catches_all_exceptions() -> None:
     def careless(rng: np.random.Generator) -> int:
         try:
             return int(rng.integers(4))

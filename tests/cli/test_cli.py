@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fake_plugins.painter import Painter
+from fake_plugins.sketch import Sketch
 from fakes import FAKES, install_plugins, write_album
 
 from bench import cli
@@ -24,7 +24,7 @@ from bench.registry import discovery
 from bench.runner.records import Log
 
 Bench = Callable[..., tuple[int, str, str]]
-PAINT = ("--task", "reconstruction:inverter=painter")
+RECONSTRUCTION = ("--task", "reconstruction:inverter=sketch")
 
 
 @pytest.fixture
@@ -47,11 +47,12 @@ def images(tmp_path: Path) -> Path:
     return write_album(tmp_path / "album")
 
 
+@pytest.mark.slow
 def test_run_writes_everything_and_prints_the_table(bench: Bench, images: Path, tmp_path: Path) -> None:
     ldp = f"ldp:epsilon=12,dictionary={write_dictionary(tmp_path)}"
     out = tmp_path / "x"
-    defenses, attacks = ("--defense", ldp, "--defense", "none"), ("--attack", "painter", "--attack", "guess")
-    command = ("run", *defenses, *attacks, "--images", images, "--out", out, *PAINT)
+    defenses, attacks = ("--defense", ldp, "--defense", "none"), ("--attack", "sketch", "--attack", "guess")
+    command = ("run", *defenses, *attacks, "--images", images, "--out", out, *RECONSTRUCTION)
     status, shown, err = bench(*command)
     assert status == 0
     assert "ldp:epsilon=12,subset_size=2" in shown
@@ -60,6 +61,7 @@ def test_run_writes_everything_and_prints_the_table(bench: Bench, images: Path, 
     assert f"written to {out}" in err
     assert "\x1b" not in shown + err
     assert {path.name for path in out.iterdir()} == {
+        ".records.jsonl.lock",
         "plan.json",
         "records.jsonl",
         "report.md",
@@ -76,32 +78,35 @@ def test_run_writes_everything_and_prints_the_table(bench: Bench, images: Path, 
     assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
 
 
+@pytest.mark.slow
 def test_default_folder_is_named_after_the_run(bench: Bench, images: Path) -> None:
-    assert bench("run", "--defense", "none", "--attack", "painter", "--images", images)[0] == 0
-    assert bench("run", "--defense", "none", "--attack", "painter", "--images", images, "--seed", 7)[0] == 0
+    assert bench("run", "--defense", "none", "--attack", "sketch", "--images", images)[0] == 0
+    assert bench("run", "--defense", "none", "--attack", "sketch", "--images", images, "--seed", 7)[0] == 0
     names = sorted(path.name for path in Path("runs").iterdir())
     assert len(names) == 2
-    assert all(name.startswith("none-painter-") and len(name) == len("none-painter-") + 8 for name in names)
+    assert all(name.startswith("none-sketch-") and len(name) == len("none-sketch-") + 8 for name in names)
 
 
+@pytest.mark.slow
 def test_json_prints_the_records(bench: Bench, images: Path) -> None:
-    status, shown, _ = bench("run", "--defense", "none", "--attack", "painter", "--images", images, "--json", "--out", "x")
+    status, shown, _ = bench("run", "--defense", "none", "--attack", "sketch", "--images", images, "--json", "--out", "x")
     assert status == 0
     printed = [json.loads(line) for line in shown.splitlines()]
     assert [record["sample"] for record in printed] == ["0.png", "1.png"]
     assert shown == Path("x/records.jsonl").read_text()
 
 
+@pytest.mark.slow
 def test_failed_photograph_gives_status_1_and_the_others_are_written(bench: Bench, images: Path) -> None:
     (images / "bad.jpg").write_bytes(b"no photograph")
-    status, shown, err = bench("run", "--defense", "none", "--attack", "painter", "--images", images, "--out", "x")
+    status, shown, err = bench("run", "--defense", "none", "--attack", "sketch", "--images", images, "--out", "x")
     assert status == 1
     assert "failed: bad.jpg, none: bad.jpg: cannot be read as an image" in err
     assert "bad.jpg" in shown
     assert len(list(Path("x/figures").iterdir())) == 2
 
 
-RUN = ("run", "--defense", "none", "--attack", "painter")
+RUN = ("run", "--defense", "none", "--attack", "sketch")
 
 
 @pytest.mark.parametrize(
@@ -111,7 +116,7 @@ RUN = ("run", "--defense", "none", "--attack", "painter")
         (("rnu",), "unknown command 'rnu'; did you mean 'run'?"),
         (("run", "--defence", "ldp"), "unknown option '--defence'; did you mean '--defense'?"),
         (("run", "--defence=ldp"), "unknown option '--defence'; did you mean '--defense'?"),
-        (("run", "--attack", "painter"), "--defense is missing"),
+        (("run", "--attack", "sketch"), "--defense is missing"),
         (("run", "--defense", "none"), "--attack is missing"),
         (("run", "--defense"), "--defense: expected one argument"),
         ((*RUN, "more"), "'more' is an unexpected argument"),
@@ -120,12 +125,12 @@ RUN = ("run", "--defense", "none", "--attack", "painter")
         ((*RUN, "--extractor", "sitf"), "unknown extractor 'sitf'; did you mean 'sift'?"),
         ((*RUN, "--extractor", "sift:upright=maybe"), "upright must be true or false"),
         ((*RUN, "--images", "absent"), "absent: no such folder"),
-        (("run", "--defense", "lpd", "--attack", "painter"), "did you mean 'ldp'?"),
-        (("run", "--defense", "ldp:epsilom=1", "--attack", "painter"), "did you mean 'epsilon'?"),
-        (("run", "--defense", "ldp:epsilon=-1", "--attack", "painter"), "epsilon"),
-        (("run", "--defense", "none", "--attack", "piantre"), "did you mean 'painter'?"),
+        (("run", "--defense", "lpd", "--attack", "sketch"), "did you mean 'ldp'?"),
+        (("run", "--defense", "ldp:epsilom=1", "--attack", "sketch"), "did you mean 'epsilon'?"),
+        (("run", "--defense", "ldp:epsilon=-1", "--attack", "sketch"), "epsilon"),
+        (("run", "--defense", "none", "--attack", "skecth"), "did you mean 'sketch'?"),
         (("run", "--defense", "none", "--attack", "guess"), "guess attacks WordSets or Subspaces; none releases Descriptors"),
-        (("run", "--defense", "ldp:dictionary=absent", "--attack", "painter"), "absent: no such file"),
+        (("run", "--defense", "ldp:dictionary=absent", "--attack", "sketch"), "absent: no such file"),
         (("list", "defences"), "did you mean 'defenses'?"),
         (("dictionary",), "bench dictionary build"),
         (("dictionary", "biuld"), "did you mean 'dictionary build'?"),
@@ -155,9 +160,10 @@ def test_empty_folder_and_unwritable_folder(bench: Bench, images: Path, tmp_path
     assert "cannot write" in err
 
 
+@pytest.mark.slow
 def test_interrupt_keeps_the_records(bench: Bench, images: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     views: list[View] = []
-    reconstruct = Painter.reconstruct
+    reconstruct = Sketch.reconstruct
 
     def interrupt(self: Any, view: View, rng: np.random.Generator) -> Any:
         views.append(view)
@@ -165,7 +171,7 @@ def test_interrupt_keeps_the_records(bench: Bench, images: Path, monkeypatch: py
             raise KeyboardInterrupt
         return reconstruct(self, view, rng)
 
-    monkeypatch.setattr(Painter, "reconstruct", interrupt)
+    monkeypatch.setattr(Sketch, "reconstruct", interrupt)
     status, _, err = bench(*RUN, "--images", images, "--out", "x")
     assert status == 130
     assert "run the same command again to go on" in err
@@ -191,6 +197,7 @@ def test_full_disk_and_memory(
     assert "Traceback" not in err
 
 
+@pytest.mark.slow
 def test_list_shows_plugins_fields_and_the_matrix(bench: Bench) -> None:
     status, shown, _ = bench("list")
     assert status == 0
@@ -218,6 +225,7 @@ def test_help_and_version(bench: Bench, capfd: pytest.CaptureFixture[str], argum
     assert "bench run --defense ldp --attack dia" in shown or "--size" in shown or "feature-privacy-bench 0" in shown
 
 
+@pytest.mark.slow
 def test_closed_pipe_is_no_error() -> None:
     reading, writing = os.pipe()
     os.close(reading)
@@ -230,6 +238,7 @@ def test_closed_pipe_is_no_error() -> None:
     assert "BrokenPipe" not in ended.stderr
 
 
+@pytest.mark.slow
 def test_shipped_networks_on_one_photograph(bench: Bench, images: Path) -> None:
     """Runs the real plugins if this checkout has their networks."""
     status, shown, err = bench(
@@ -250,6 +259,7 @@ def test_works_without_a_terminal(tmp_path: Path) -> None:
     assert ended.stderr == b""
 
 
+@pytest.mark.slow
 def test_dataset_is_written_in_a_layout(bench: Bench) -> None:
     tiny = "gallery:width=64,height=48,detail=0.1"
     status, shown, _ = bench("dataset", tiny, "--views", 2, "--queries", 2, "--seed", 3, "--layout", "colmap", "--out", "x")
@@ -264,6 +274,7 @@ def test_dataset_is_written_in_a_layout(bench: Bench) -> None:
     np.testing.assert_array_equal(mask, drawn)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
@@ -289,10 +300,11 @@ def test_invalid_arguments_of_dataset(bench: Bench, arguments: tuple[str, ...], 
     assert not Path("x").exists()
 
 
+@pytest.mark.slow
 def test_leaderboard_of_two_runs(bench: Bench, images: Path, tmp_path: Path) -> None:
     ldp = f"ldp:epsilon=12,dictionary={write_dictionary(tmp_path)}"
     for name, defense in (("one", "none"), ("two", ldp)):
-        assert bench("run", "--defense", defense, "--attack", "painter", "--images", images, "--out", f"runs/{name}")[0] == 0
+        assert bench("run", "--defense", defense, "--attack", "sketch", "--images", images, "--out", f"runs/{name}")[0] == 0
     status, shown, err = bench("leaderboard", "--results", "runs", "--out", "site")
     assert (status, shown) == (0, "")
     assert err.splitlines()[-1] == "bench: written to site/index.html (comparison groups: 1, experiments: 2, records: 4)"
@@ -301,11 +313,12 @@ def test_leaderboard_of_two_runs(bench: Bench, images: Path, tmp_path: Path) -> 
     assert len(list(Path("site/pictures").iterdir())) == 2 + 4  # photographs once each, and the reconstructions
     page = Path("site/index.html").read_text()
     assert "no adapted attacker was run (dia)" in page
-    assert "bench run --defense none --attack painter --images album --seed 0" in page
+    assert "bench run --defense none --attack sketch --images album --seed 0" in page
     for link in re.findall(r'(?:href|src|data-made|data-original)="([^"#:]+)"', page):
         assert (Path("site") / link).is_file()
 
 
+@pytest.mark.slow
 def test_leaderboard_of_several_results(bench: Bench, images: Path) -> None:
     for seed in (0, 1, 2):
         assert bench(*RUN, "--images", images, "--seed", seed, "--out", f"runs/{seed}")[0] == 0
@@ -338,6 +351,7 @@ def test_invalid_arguments_of_leaderboard(bench: Bench, arguments: tuple[str, ..
     assert not Path("x").exists()
 
 
+@pytest.mark.slow
 def test_leaderboard_needs_a_folder_and_undamaged_records(bench: Bench, images: Path) -> None:
     assert bench(*RUN, "--images", images, "--out", "runs")[0] == 0
     status, _, err = bench("leaderboard", "--results", "runs", "--out", images / "0.png")

@@ -1,4 +1,4 @@
-"""Building dictionaries, and refusing damaged ones."""
+"""Construction of dictionaries, and errors of damaged ones."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ from bench.images import photographs
 
 @pytest.fixture(scope="module")
 def album(tmp_path_factory):
-    """Three of the built-in photographs, as a user's folder."""
+    """A folder with three of the dictionary_file-in photographs."""
     folder = tmp_path_factory.mktemp("album")
     for source in photographs.list_builtin()[:3]:
         (folder / source.path.name).write_bytes(source.path.read_bytes())
@@ -23,40 +23,43 @@ def album(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def built(album, tmp_path_factory):
+def dictionary_file(album, tmp_path_factory):
     return build.build(album, 500, tmp_path_factory.mktemp("k") / "K.safetensors", Sift(), seed=3)
 
 
-def test_words_are_distinct_and_near_the_descriptors(built, album):
-    assert built.words.shape == (500, 128)
-    assert built.words.dtype == np.uint8
-    assert len(np.unique(built.words, axis=0)) == 500
-    assert len(built.photographs) == 3
+@pytest.mark.slow
+def test_words_are_distinct_and_near_the_descriptors(dictionary_file, album):
+    assert dictionary_file.words.shape == (500, 128)
+    assert dictionary_file.words.dtype == np.uint8
+    assert len(np.unique(dictionary_file.words, axis=0)) == 500
+    assert len(dictionary_file.photographs) == 3
     # Words drawn from the descriptors at random are the obvious alternative to clustering.
     seen = np.concatenate([Sift().extract(photographs.read(path).pixels).codes for path in sorted(album.iterdir())])
     drawn = seen[np.random.default_rng(0).choice(len(seen), 500, replace=False)]
-    assert build.mean_cosine(seen, built.words) > build.mean_cosine(seen[500:], drawn) + 0.005
+    assert build.mean_cosine(seen, dictionary_file.words) > build.mean_cosine(seen[500:], drawn) + 0.005
 
 
-def test_the_same_seed_gives_the_same_file(built, album, tmp_path):
+@pytest.mark.slow
+def test_the_same_seed_gives_the_same_file(dictionary_file, album, tmp_path):
     again = build.build(album, 500, tmp_path / "K.safetensors", Sift(), seed=3)
     other = build.build(album, 500, tmp_path / "L.safetensors", Sift(), seed=4)
-    assert again.digest == built.digest != other.digest
+    assert again.digest == dictionary_file.digest != other.digest
 
 
-def test_the_order_of_words_tells_nothing(built):
-    """Neighbours in the file are no nearer to each other than any two words."""
-    rows = unit_rows(built.words)
+def test_words_are_in_random_order(dictionary_file):
+    """Adjacent words in the file are as distant as any two words."""
+    rows = unit_rows(dictionary_file.words)
     cosines = rows @ rows.T
     assert abs(np.diagonal(cosines, 1).mean() - cosines[np.triu_indices(500, 1)].mean()) < 0.03
 
 
-def test_sub_databases_part_the_words(built):
-    parts = [built.sub_database(index, 16) for index in range(16)]
-    assert np.array_equal(np.concatenate(parts), built.words)
+def test_sub_databases_partition_the_words(dictionary_file):
+    parts = [dictionary_file.sub_database(index, 16) for index in range(16)]
+    assert np.array_equal(np.concatenate(parts), dictionary_file.words)
     assert {len(part) for part in parts} <= {31, 32}
 
 
+@pytest.mark.slow
 def test_more_words_than_descriptors(album, tmp_path, capsys):
     out = tmp_path / "K.safetensors"
     assert main(["dictionary", "build", "--images", str(album), "--size", "1000000", "--out", str(out)]) == 2
@@ -64,19 +67,20 @@ def test_more_words_than_descriptors(album, tmp_path, capsys):
     assert not out.exists()
 
 
+@pytest.mark.slow
 def test_from_the_command_line(album, tmp_path, capsys):
     out = tmp_path / "K.safetensors"
     assert main(["dictionary", "build", "--images", str(album), "--size", "64", "--out", str(out)]) == 0
     assert "64 words" in capsys.readouterr().out
     assert len(dictionary.load(out)) == 64
     assert main(["dictionary", "build", "--images", str(album), "--size", "32", "--out", str(out)]) == 2
-    assert "there already" in capsys.readouterr().err.splitlines()[-1]
+    assert "exists already" in capsys.readouterr().err.splitlines()[-1]
     assert len(dictionary.load(out)) == 64
 
 
-def test_a_flipped_bit_is_noticed(built, tmp_path):
+def test_flipped_bit_is_detected(dictionary_file, tmp_path):
     path = tmp_path / "K.safetensors"
-    dictionary.save(path, built.words, built.meta)
+    dictionary.save(path, dictionary_file.words, dictionary_file.meta)
     content = bytearray(path.read_bytes())
     content[-1] ^= 1
     path.write_bytes(content)
@@ -84,9 +88,13 @@ def test_a_flipped_bit_is_noticed(built, tmp_path):
         dictionary.load(path)
 
 
-def test_a_changed_description_is_noticed(built, tmp_path):
+def test_changed_metadata_is_detected(dictionary_file, tmp_path):
     path = tmp_path / "K.safetensors"
-    save_file({"words": built.words}, path, {"kind": "dictionary", "digest": built.digest, "meta": '{"photographs": []}'})
+    save_file(
+        {"words": dictionary_file.words},
+        path,
+        {"kind": "dictionary", "digest": dictionary_file.digest, "meta": '{"photographs": []}'},
+    )
     with pytest.raises(UserError, match="checksum"):
         dictionary.load(path)
 
@@ -94,12 +102,12 @@ def test_a_changed_description_is_noticed(built, tmp_path):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"", "not a whole safetensors file"),
-        (b"not a dictionary at all", "not a whole safetensors file"),
+        (b"", "not a complete safetensors file"),
+        (b"not a dictionary at all", "not a complete safetensors file"),
         (None, "no such file"),
     ],
 )
-def test_files_that_are_none(content, message, tmp_path):
+def test_invalid_files(content, message, tmp_path):
     path = tmp_path / "K.safetensors"
     if content is not None:
         path.write_bytes(content)
@@ -115,7 +123,7 @@ def test_files_that_are_none(content, message, tmp_path):
         (np.ones((4, 128), np.uint8), "inversion-network", "holds inversion-network, not dictionary"),
     ],
 )
-def test_content_that_is_none(words, kind, message, tmp_path):
+def test_invalid_content(words, kind, message, tmp_path):
     path = tmp_path / "K.safetensors"
     tensor_file.save(path, kind, {"words": words}, {"photographs": []})
     with pytest.raises(UserError, match=message):

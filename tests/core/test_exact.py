@@ -1,4 +1,4 @@
-"""Numbers that are kept as they were written."""
+"""Numbers with their exact value."""
 
 import math
 import pickle
@@ -23,7 +23,7 @@ from bench.core.exact import Exact, to_fraction
         (" -2 ", Fraction(-2), "-2.0"),
     ],
 )
-def test_text_is_kept_exactly(text: str, fraction: Fraction, written: str) -> None:
+def test_text_is_exact(text: str, fraction: Fraction, written: str) -> None:
     number = Exact(text)
     assert number.fraction == fraction == to_fraction(number)
     assert number == float(fraction)
@@ -32,12 +32,12 @@ def test_text_is_kept_exactly(text: str, fraction: Fraction, written: str) -> No
 
 
 @given(st.fractions() | st.decimals(allow_nan=False, allow_infinity=False, min_value=-(10**9), max_value=10**9))
-def test_fractions_and_decimals_are_kept(value: Fraction | Decimal) -> None:
+def test_fractions_and_decimals_are_exact(value: Fraction | Decimal) -> None:
     assert to_fraction(Exact(value)) == Fraction(value)
     assert to_fraction(Exact(str(Exact(value)))) == Fraction(value)
 
 
-def test_a_float_is_the_decimal_that_it_prints() -> None:
+def test_float_stands_for_its_printed_decimal() -> None:
     assert to_fraction(0.1) == Fraction(1, 10) != Fraction(0.1)
     assert to_fraction(Exact(0.1)) == Fraction(1, 10)
     assert to_fraction(3) == 3
@@ -53,10 +53,10 @@ def test_infinity() -> None:
 
 
 @pytest.mark.parametrize("text", ["", "nan", "much", "1/0", "1e400", "1/2/3"])
-def test_no_number(text: str) -> None:
+def test_invalid_text(text: str) -> None:
     with pytest.raises(ValueError, match=r"."):
         Exact(text)
 
 
-def test_a_copy_is_as_exact() -> None:
+def test_copy_is_exact() -> None:
     assert to_fraction(pickle.loads(pickle.dumps(Exact("1/3")))) == Fraction(1, 3)

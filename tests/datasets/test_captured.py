@@ -76,14 +76,16 @@ def test_queries_can_be_consecutive(dataset: Captured) -> None:
         replace(dataset, leading=COUNT).scene()
 
 
-def test_model_is_cached_by_content(dataset: Captured, photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_model_is_cached_by_content(
+    dataset: Captured, photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     before = dataset.scene()
 
-    class RebuiltError(Exception):
+    class RepeatedError(Exception):
         pass
 
     def rebuild(*arguments: object) -> None:
-        raise RebuiltError
+        raise RepeatedError
 
     monkeypatch.setattr(captured, "_run_structure_from_motion", rebuild)
     twice = replace(dataset, length=2 * dataset.length).scene()
@@ -95,7 +97,7 @@ def test_model_is_cached_by_content(dataset: Captured, photographs: Path, tmp_pa
         (copied / path.name).write_bytes(path.read_bytes())
     assert len(replace(dataset, path=copied).scene().references) == len(before.references)  # the same content elsewhere
     Image.open(copied / "3.png").transpose(Image.Transpose.ROTATE_180).save(copied / "3.png")
-    with pytest.raises(RebuiltError):
+    with pytest.raises(RepeatedError):
         replace(dataset, path=copied).scene()
 
 

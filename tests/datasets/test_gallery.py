@@ -1,4 +1,4 @@
-"""The gallery: what is drawn agrees with the poses, the masks and the fields."""
+"""The gallery: rendered images agree with the poses, the masks and the fields."""
 
 import hashlib
 import pickle
@@ -30,11 +30,11 @@ def scene() -> Scene:
     return SMALL.scene()
 
 
-def test_scene_is_what_was_asked_for(scene: Scene) -> None:
+def test_scene_follows_the_fields(scene: Scene) -> None:
     assert (len(scene.references), len(scene.queries), scene.unit) == (12, 6, "metre")
     assert [query.condition for query in scene.queries] == ["day"] * 4 + ["night"] * 2
     names = [image.name for image in scene.references + scene.queries]
-    assert len({name.rpartition("/")[2] for name in names}) == 18  # the evaluation server knows queries by basename
+    assert len({name.rpartition("/")[2] for name in names}) == 18  # the evaluation server identifies queries by basename
     assert len({query.camera.focal_length for query in scene.queries}) > 1
     for image in (scene.references[0], scene.queries[0]):
         assert image.pixels.read().shape == (240, 320, 3)
@@ -42,13 +42,13 @@ def test_scene_is_what_was_asked_for(scene: Scene) -> None:
 
 
 def sift(pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    finder = cv2.SIFT_create(nfeatures=800, contrastThreshold=0.02, enable_precise_upscale=True)
-    points, descriptors = finder.detectAndCompute(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), None)
+    detector = cv2.SIFT_create(nfeatures=800, contrastThreshold=0.02, enable_precise_upscale=True)
+    points, descriptors = detector.detectAndCompute(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), None)
     return np.array([point.pt for point in points]) + 0.5, descriptors
 
 
-def matched(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Indices (n, 2) of mutual nearest neighbours that pass the ratio test."""
+def match_descriptors(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Match mutual nearest neighbours that pass the ratio test. -> (n, 2) indices"""
     distance = cdist(one, other)
     nearest = distance.argmin(axis=1)
     two = np.partition(distance, 1, axis=1)
@@ -56,26 +56,26 @@ def matched(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     return np.stack([np.flatnonzero(good), nearest[good]], axis=1)
 
 
-def lifted(image: Reference, seen: Shot, points: np.ndarray) -> np.ndarray:
-    """Points of an image on the surfaces that they show. (n, 2) -> (n, 3)"""
+def lift_to_surfaces(image: Reference, rendering: Shot, points: np.ndarray) -> np.ndarray:
+    """Lift points of an image to the visible surfaces. (n, 2) -> (n, 3)"""
     column, row = points.astype(int).T
     rays = np.append(image.camera.cam_from_img(points), np.ones((len(points), 1)), axis=1)
     pose = image.cam_from_world.inverse()
-    return (rays * seen.depth[row, column, None]) @ pose.rotation.matrix().T + pose.translation
+    return (rays * rendering.depth[row, column, None]) @ pose.rotation.matrix().T + pose.translation
 
 
 @pytest.mark.parametrize("index", [3, 51])
 def test_matches_of_two_views_agree_with_the_poses(index: int) -> None:
-    """SIFT knows nothing of the poses; what it matches lies where the poses and depths say, to a pixel."""
+    """SIFT matches, found without the poses, agree with the poses and depths to a pixel."""
     walk = replace(SMALL, views=80, people=0.0)
     one, other = walk.scene().references[index : index + 2]
-    seen = render(walk, "reference", index)
-    (points, descriptors), (expected, others) = sift(seen.pixels), sift(other.pixels.read())
+    rendering = render(walk, "reference", index)
+    (points, descriptors), (expected, others) = sift(rendering.pixels), sift(other.pixels.read())
     column, row = points.astype(int).T
-    placed = np.isfinite(seen.depth[row, column])  # the sky has no place
-    points, descriptors = points[placed], descriptors[placed]
-    pairs = matched(descriptors, others)
-    world, expected = lifted(one, seen, points[pairs[:, 0]]), expected[pairs[:, 1]]
+    on_surface = np.isfinite(rendering.depth[row, column])  # the sky has no surface
+    points, descriptors = points[on_surface], descriptors[on_surface]
+    pairs = match_descriptors(descriptors, others)
+    world, expected = lift_to_surfaces(one, rendering, points[pairs[:, 0]]), expected[pairs[:, 1]]
 
     def error(pose: pycolmap.Rigid3d) -> float:
         in_camera = world @ pose.rotation.matrix().T + pose.translation
@@ -89,7 +89,7 @@ def test_matches_of_two_views_agree_with_the_poses(index: int) -> None:
     assert error(pycolmap.Rigid3d(pycolmap.Rotation3d(), np.array([0.1, 0, 0])) * other.cam_from_world) > 2.5
 
 
-def test_same_seed_same_pixels_and_another_seed_another_gallery(scene: Scene) -> None:
+def test_same_seed_gives_same_pixels_and_another_seed_another_gallery(scene: Scene) -> None:
     source = scene.references[0].pixels
     before = source.read()
     for cached in (gallery._load_model, gallery._load_building, render):
@@ -115,7 +115,7 @@ def test_more_views_leave_the_queries_as_they_were(scene: Scene) -> None:
 
 
 def test_masks_cover_the_people_and_nothing_else() -> None:
-    """Without people the same camera sees the same depth, except where the mask says that they stood."""
+    """Without people the same camera sees the same depth, except inside the mask."""
     crowded, empty = replace(SMALL, people=4.0), replace(SMALL, people=0.0)
     total = 0
     for index in range(3):
@@ -129,7 +129,7 @@ def test_masks_cover_the_people_and_nothing_else() -> None:
     assert total > 2000
 
 
-def test_people_of_the_map_and_of_queries_have_nothing_in_common() -> None:
+def test_people_of_the_map_and_of_queries_differ() -> None:
     drawn = [
         hashlib.sha256(person.pixels.tobytes()).digest() for people in gallery._create_people(0).values() for person in people
     ]
@@ -152,14 +152,14 @@ def test_night_is_darker_noisier_and_otherwise_the_same() -> None:
         one, other = render(day, "query", index), render(night, "query", index)
         np.testing.assert_array_equal(one.depth, other.depth)
         np.testing.assert_array_equal(one.foreground, other.foreground)
-        assert noise(other.pixels) > 1.5 * noise(one.pixels)
+        assert measure_noise(other.pixels) > 1.5 * measure_noise(one.pixels)
         assert other.pixels.mean() < one.pixels.mean()
-        red_over_blue = [seen.pixels[..., 0].mean() / seen.pixels[..., 2].mean() for seen in (one, other)]
+        red_over_blue = [rendering.pixels[..., 0].mean() / rendering.pixels[..., 2].mean() for rendering in (one, other)]
         assert red_over_blue[1] > 1.1 * red_over_blue[0]  # lamps are warm
 
 
-def noise(pixels: np.ndarray) -> float:
-    """What neighbours do not share, in the calmest quarter of the image."""
+def measure_noise(pixels: np.ndarray) -> float:
+    """Measure differences between neighbouring pixels, in the smoothest quarter of the image."""
     values = pixels.astype(np.float32)
     residue = np.abs(values - cv2.blur(values, (3, 3))).mean(axis=2)
     return float(np.quantile(residue, 0.25))
@@ -170,29 +170,29 @@ def test_fields_make_queries_harder() -> None:
     blurred = render(replace(SMALL, blur=3.0, noise=0.0), "query", 0).pixels
     noisy = render(replace(SMALL, blur=0.0, noise=8.0), "query", 0).pixels
     assert cv2.Laplacian(blurred, cv2.CV_32F).std() < 0.6 * cv2.Laplacian(sharp, cv2.CV_32F).std()
-    assert noise(noisy) > 2 * noise(sharp)
+    assert measure_noise(noisy) > 2 * measure_noise(sharp)
 
     def departure(viewpoint: float) -> float:
-        """How far queries are from a thousand references, in metres, on average."""
+        """Measure the mean distance of queries from a thousand references, in metres."""
         queries = replace(SMALL, viewpoint=viewpoint, queries=30).scene().queries
-        places = np.array(
+        stations = np.array(
             [walks.compute_station(ROOMS[0], lap, share).centre for lap in range(2) for share in np.linspace(0, 1, 500)]
         )
         centres = np.array([query.cam_from_world.inverse().translation for query in queries])
-        return float(np.linalg.norm(centres[:, None] - places[None], axis=2).min(axis=1).mean())
+        return float(np.linalg.norm(centres[:, None] - stations[None], axis=2).min(axis=1).mean())
 
     assert departure(0.0) < departure(1.0) < departure(2.5)
 
 
 def test_bare_walls_and_repeated_pictures() -> None:
-    def pictures(**fields: float) -> tuple[int, int]:
-        """How many surfaces there are, and how many textures."""
+    def count_pictures(**fields: float) -> tuple[int, int]:
+        """Count surfaces and textures."""
         surfaces, _ = furnish(0, **({"repeats": 0.1, "bare": 0.1, "detail": 0.1} | fields))
         return len(surfaces), len({surface.texture for surface in surfaces})
 
-    full, usual, bare = pictures(bare=0.0), pictures(bare=0.3), pictures(bare=1.0)
+    full, usual, bare = count_pictures(bare=0.0), count_pictures(bare=0.3), count_pictures(bare=1.0)
     assert full[0] > usual[0] > bare[0]
-    varied, repeated = pictures(repeats=0.0), pictures(repeats=0.9)
+    varied, repeated = count_pictures(repeats=0.0), count_pictures(repeats=0.9)
     assert varied[0] - varied[1] < repeated[0] - repeated[1]
 
 

@@ -1,4 +1,4 @@
-"""Affine lifting: what must lie in D, what a re-parameterisation may share with another, and controls that give d away."""
+"""Affine lifting: the contents of D, the independence of re-parameterisations, and controls that reveal d."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +14,7 @@ from bench.codebook.public import Public
 from bench.core.errors import SampleError, UserError
 from bench.geometry.nearest_words import unit_rows
 from bench.settings import Asset
-from bench.testing import same
+from bench.testing import are_equal
 from bench.types import Features
 from defenses.affine import PLUGIN as AFFINE
 from defenses.affine import lift, reparameterise
@@ -55,7 +55,7 @@ def projectors(bases: np.ndarray) -> np.ndarray:
     return np.einsum("nid,nie->nde", bases.astype(float), bases.astype(float))
 
 
-# ---- what lies in D
+# ---- the contents of D
 
 
 @pytest.mark.parametrize("lifting", LIFTINGS)
@@ -66,40 +66,40 @@ def test_the_descriptor_and_words_of_one_sub_database_lie_in_d(tmp_path: Path, l
     defense = AFFINE(lifting=lifting, dim=dim, database=make_database(tmp_path, words))
     lifted = defense.lift(secret, Public(), np.random.default_rng(dim))
     release = lifted.release
-    assert same(release, defense.protect(secret, Public(), np.random.default_rng(dim)))
+    assert are_equal(release, defense.protect(secret, Public(), np.random.default_rng(dim)))
     assert (release.origins.dtype, release.bases.dtype) == (np.float32, np.float32)
     assert (release.origins.shape, release.bases.shape) == ((30, 128), (30, dim, 128))
     own = np.diagonal(distances(secret.descriptors, release.origins, release.bases))
     assert own.max() < EXACT
     gram = np.einsum("nid,njd->nij", release.bases.astype(float), release.bases.astype(float))
     assert np.abs(gram - np.eye(dim)).max() < EXACT
-    # Exactly as many words as were asked for, all of one sub-database, and none that was not.
+    # Exactly the configured number of words, all of one sub-database.
     inside = distances(unit_rows(words), release.origins, release.bases) < EXACT  # (N, K)
     assert (inside.sum(axis=1) == COUNT[lifting](dim)).all()
-    assert np.array_equal(np.nonzero(inside)[1].reshape(30, -1), np.sort(lifted.words, axis=1))  # those that it tells its owner
+    assert np.array_equal(np.nonzero(inside)[1].reshape(30, -1), np.sort(lifted.words, axis=1))  # the words in `LiftedRelease`
     assert len(np.unique(np.nonzero(inside)[1] // 100)) <= 1  # 16 sub-databases of 100 words
-    # The control: words that were not drawn, and another's descriptor, are far away.
+    # The control: words that were not drawn and other descriptors are far away.
     others = distances(unit_rows(words), release.origins, release.bases)[~inside]
     assert others.min() > 0.01
-    strangers = distances(secret.descriptors, release.origins, release.bases)[~np.eye(30, dtype=bool)]
-    assert strangers.min() > 0.01
+    other_distances = distances(secret.descriptors, release.origins, release.bases)[~np.eye(30, dtype=bool)]
+    assert other_distances.min() > 0.01
 
 
-def test_one_sub_database_a_photograph_and_all_in_turn(tmp_path: Path) -> None:
+def test_one_sub_database_per_photograph_and_all_equally_often(tmp_path: Path) -> None:
     words, public, secret = make_words(64), Public(), make_features(3)
     defense = AFFINE(dim=4, sub_databases=4, database=make_database(tmp_path, words))
     used = np.zeros(4, dtype=int)
-    drawn = np.zeros(64, dtype=int)
+    counts = np.zeros(64, dtype=int)
     for seed in range(400):
         release = defense.protect(secret, public, np.random.default_rng(seed))
         inside = distances(unit_rows(words), release.origins, release.bases) < EXACT
-        of = np.unique(np.nonzero(inside)[1] // 16)
-        assert len(of) == 1
-        used[of] += 1
-        drawn += inside.sum(axis=0)
+        parts = np.unique(np.nonzero(inside)[1] // 16)
+        assert len(parts) == 1
+        used[parts] += 1
+        counts += inside.sum(axis=0)
     assert stats.chisquare(used).pvalue > ALPHA
     for part in range(4):  # within a sub-database, every word equally often
-        assert stats.chisquare(drawn[part * 16 : part * 16 + 16]).pvalue > ALPHA
+        assert stats.chisquare(counts[part * 16 : part * 16 + 16]).pvalue > ALPHA
 
 
 # ---- re-parameterisation
@@ -123,13 +123,13 @@ def hides_the_descriptor(reparameterise: Reparameterise) -> bool:
 
 
 def shares_nothing_but_d(reparameterise: Reparameterise) -> bool:
-    """Two re-parameterisations of one D: the same D to 1e-5, and bases and origins that say nothing of each other."""
+    """Two re-parameterisations of one D: the same D to 1e-5, and independent bases and origins."""
     d, span = lift_examples()
     (o1, b1), (o2, b2) = (reparameterise(d, span, np.random.default_rng(seed)) for seed in (1, 2))
     assert np.abs(projectors(b1) - projectors(b2)).max() < EXACT
     apart = (o2 - o1).astype(float)
     assert np.abs(apart - np.einsum("nde,ne->nd", projectors(b1), apart)).max() < EXACT
-    # In coordinates of D, basis vectors are directions without preference, so cosines have mean 0 and mean square 1 / dim.
+    # In coordinates of D, basis vectors are uniform directions, so cosines have mean 0 and mean square 1 / dim.
     cosines = np.einsum("nid,njd->nij", b1.astype(float), b2.astype(float))  # (N, dim, dim)
     error = 1 / np.sqrt(len(d) * 4)
     unlike = np.abs(cosines.mean(axis=0)).max() < 5 * error and np.abs(np.square(cosines).mean(axis=0) - 1 / 4).max() < 5 * error
@@ -137,7 +137,7 @@ def shares_nothing_but_d(reparameterise: Reparameterise) -> bool:
 
 
 def is_invariant(reparameterise: Reparameterise) -> bool:
-    """With the same random vectors, any point and any basis that describe D give the same release."""
+    """With the same random vectors, all points and bases that describe D give the same release."""
     d, span = lift_examples()
     rng = np.random.default_rng(3)
     turn = np.linalg.qr(rng.normal(size=(len(d), 4, 4))).Q
@@ -179,18 +179,18 @@ def test_reparameterisation() -> None:
     assert hides_the_directions(reparameterise)
 
 
-def test_control_an_origin_at_the_descriptor_is_caught() -> None:
+def test_control_an_origin_at_the_descriptor_is_detected() -> None:
     assert not hides_the_descriptor(keeps_the_origin)
     assert not shares_nothing_but_d(keeps_the_origin)
     assert not is_invariant(keeps_the_origin)
 
 
-def test_control_a_basis_used_twice_is_caught() -> None:
+def test_control_a_reused_basis_is_detected() -> None:
     assert not shares_nothing_but_d(keeps_the_basis)
     assert not is_invariant(keeps_the_basis)
 
 
-def test_control_a_basis_with_lapacks_signs_is_caught() -> None:
+def test_control_a_basis_with_lapacks_signs_is_detected() -> None:
     assert not is_invariant(keeps_lapacks_signs)
     assert not hides_the_directions(keeps_lapacks_signs)
 
@@ -224,7 +224,7 @@ def test_a_word_that_is_the_descriptor_is_never_drawn() -> None:
     np.testing.assert_allclose(np.einsum("nid,njd->nij", span, span), np.tile(np.eye(4), (100, 1, 1)), atol=1e-9)
 
 
-def test_a_database_of_nothing_else_is_a_failed_unit() -> None:
+def test_a_database_of_the_descriptor_alone_fails_the_sample() -> None:
     secret = make_features(1)
     assert secret.codes is not None
     with pytest.raises(SampleError, match="every draw of 2 words"):
@@ -278,14 +278,14 @@ def test_wrong_configuration(wrong: dict, message: str) -> None:
     assert str(caught.value) == message
 
 
-def test_odd_dimensions_where_nothing_is_halved() -> None:
+def test_odd_dimensions_without_hybrid_lifting() -> None:
     assert AFFINE(lifting="adversarial", dim=3).adversarial == 3
     assert AFFINE(lifting="random", dim=3).adversarial == 0
 
 
-def test_a_database_that_does_not_do(tmp_path: Path) -> None:
+def test_unsuitable_databases(tmp_path: Path) -> None:
     database = make_database(tmp_path, make_words(47))  # 16 sub-databases of 2 or 3 words
-    with pytest.raises(UserError, match="affine: 3 words a keypoint, but 47 words in 16 sub-databases leave 2 each"):
+    with pytest.raises(UserError, match="affine: 3 words per keypoint, but 47 words in 16 sub-databases leave 2 each"):
         AFFINE(dim=6, database=database).protect(make_features(2), Public(), np.random.default_rng(0))
     assert AFFINE(dim=4, database=database).protect(make_features(2), Public(), np.random.default_rng(0)).dim == 4
     longer = Features(
@@ -295,7 +295,7 @@ def test_a_database_that_does_not_do(tmp_path: Path) -> None:
         AFFINE(database=database).protect(longer, Public(), np.random.default_rng(0))
 
 
-def test_an_attacker_is_trained_for_what_is_served() -> None:
+def test_supported_settings_are_valid() -> None:
     for dim in AFFINE.supported_settings["dim"].values:  # type: ignore[union-attr]
         AFFINE(dim=dim)
     assert 3 not in AFFINE.supported_settings["dim"]

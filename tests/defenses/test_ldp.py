@@ -93,14 +93,15 @@ def test_digits_of_p_against_rational_arithmetic(epsilon: float, domain: int, si
         assert chance_digits(epsilon, domain, size, bits) == expected
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(
     epsilon=st.floats(0, 20, allow_subnormal=False).filter(lambda e: e == 0 or e > 1e-6),
     domain=st.integers(2, 10**6),
     share=st.floats(0, 1),
 )
-def test_digits_of_p_against_rational_arithmetic_anywhere(epsilon: float, domain: int, share: float) -> None:
-    size = max(1, round(share * domain))
+def test_digits_of_p_against_rational_arithmetic_anywhere(epsilon: float, domain: int, fraction: float) -> None:
+    size = max(1, round(fraction * domain))
     low, high = chance_bounds(epsilon, domain, size)
     digits = chance_digits(epsilon, domain, size, 64)
     assert math.floor(low * 2**64) <= digits <= math.floor(high * 2**64)
@@ -120,7 +121,7 @@ def test_epsilon_may_be_a_fraction(text: str) -> None:
     low, high = chance_bounds(Exact(text), 6, 2)
     digits = chance_digits(Exact(text), 6, 2, 192)
     assert math.floor(low * 2**192) == digits == math.floor(high * 2**192)
-    # The control: the nearest double is another number, unless it is that very one.
+    # The control: the nearest double is another number, unless the fraction is a double.
     assert (digits == chance_digits(float(Exact(text)), 6, 2, 192)) == (text == "21/2")
 
 
@@ -160,18 +161,18 @@ def test_log10_of_p(epsilon: float, domain: int, size: int) -> None:
 
 
 class Scripted:
-    """A generator whose bits are given numbers of 320 bits, one a row, handed out to the rows that still equal p."""
+    """A generator whose bits are given numbers of 320 bits, one per row, returned for the rows that still equal p."""
 
     def __init__(self, numbers: list[int], chance: int) -> None:
         self.numbers, self.chance, self.calls = numbers, chance, 0
 
     def integers(self, low: int, *, size: int, dtype: Any, endpoint: bool) -> np.ndarray:
         assert (low, dtype, endpoint) == (2**64 - 1, np.uint64, True)
-        known = 320 - 64 * self.calls  # bits not yet handed out
-        undecided = [number for number in self.numbers if number >> known == self.chance >> known]
+        remaining = 320 - 64 * self.calls  # bits
+        undecided = [number for number in self.numbers if number >> remaining == self.chance >> remaining]
         assert len(undecided) == size
         self.calls += 1
-        return np.array([number >> (known - 64) & (2**64 - 1) for number in undecided], dtype=np.uint64)
+        return np.array([number >> (remaining - 64) & (2**64 - 1) for number in undecided], dtype=np.uint64)
 
 
 @pytest.mark.parametrize(
@@ -183,14 +184,14 @@ def test_draw_goes_on_where_the_bits_equal_those_of_p(epsilon: float, domain: in
     low, high = chance_bounds(epsilon, domain, size, terms=400)
     digits = math.floor(low * 2**320)
     assert digits == math.floor(high * 2**320), "the reference is not fine enough"
-    near = [digits + sign * 2**place for place in (319, 255, 200, 150, 70, 63, 10, 0) for sign in (-1, 1)]
+    near = [digits + sign * 2**digit for digit in (319, 255, 200, 150, 70, 63, 10, 0) for sign in (-1, 1)]
     numbers = [number for number in near if 0 <= number < 2**320]
     expected = [Fraction(number, 2**320) < low for number in numbers]
     rng = Scripted(numbers, digits)
-    told = draw_inclusion(len(numbers), epsilon, domain, size, rng)  # type: ignore[arg-type]
-    assert told.tolist() == expected
+    included = draw_inclusion(len(numbers), epsilon, domain, size, rng)  # type: ignore[arg-type]
+    assert included.tolist() == expected
     assert rng.calls == 5
-    # The control: 64 bits alone decide wrongly, unless p is so small that no row is told either way.
+    # The control: 64 bits alone decide wrongly, unless p is so small that no row is included either way.
     assert [number >> 256 < digits >> 256 for number in numbers] != expected or not any(expected)
 
 
@@ -211,13 +212,13 @@ def subsets_fit(sampler: Sampler, domain: int, size: int, epsilon: float, draws:
     words = sampler(np.full(draws, true), domain, epsilon, size, rng)
     law = enumerate_sets(epsilon, domain, size)
     codes = np.bincount((np.sort(words, axis=1) * domain ** np.arange(size)).sum(axis=1), minlength=domain**size)
-    observed = [int(codes[sum(word * domain**place for place, word in enumerate(Z))]) for Z in law]
+    observed = [int(codes[sum(word * domain**digit for digit, word in enumerate(Z))]) for Z in law]
     assert sum(observed) == draws, "a row is no set of `size` words"
     expected = [draws * by_word[true] for by_word in law.values()]
     return float(stats.chisquare(observed, expected).pvalue)
 
 
-# Some are drawn word by word (m² ≤ |K|), some without repetition.
+# Some are drawn independently (m² ≤ |K|), some without replacement.
 CASES = [(12, 3, 2.0), (6, 2, 0.0), (6, 2, 1.0), (6, 2, 3.0), (6, 3, 0.0), (6, 3, 1.0), (6, 3, 3.0), (6, 1, 1.0), (5, 4, 2.0)]
 
 
@@ -241,19 +242,19 @@ def mechanism_with(wrong_chance: Callable[[float, int, int], float]) -> Sampler:
     """The mechanism with another p."""
 
     def sample(true: np.ndarray, domain: int, epsilon: float, size: int, rng: np.random.Generator) -> np.ndarray:
-        told = rng.random(len(true)) < wrong_chance(epsilon, domain, size)
+        included = rng.random(len(true)) < wrong_chance(epsilon, domain, size)
         words = np.empty((len(true), size), dtype=np.int64)
         for u in (False, True):
-            others = draw_distinct(int((told == u).sum()), domain - 1, size - u, rng)
-            words[told == u, int(u) :] = others + (others >= true[told == u, None])
-        words[told, 0] = true[told]
+            others = draw_distinct(int((included == u).sum()), domain - 1, size - u, rng)
+            words[included == u, int(u) :] = others + (others >= true[included == u, None])
+        words[included, 0] = true[included]
         return words
 
     return sample
 
 
 def true_word_first(true: np.ndarray, domain: int, epsilon: float, size: int, rng: np.random.Generator) -> np.ndarray:
-    """The mechanism with the right law of sets, but with an order that tells."""
+    """The mechanism with the right law of sets, but with an order that reveals the true word."""
     return mechanism_with(chance)(true, domain, epsilon, size, rng)
 
 
@@ -269,7 +270,7 @@ def test_the_control_mechanism_is_sound_with_the_right_p() -> None:
         lambda e, domain, m: m * math.exp(e) / (m * math.exp(e) + domain),  # |K| for |K| − m
         lambda e, domain, m: math.exp(e) / (math.exp(e) + domain - 1),  # k-ary randomised response
         lambda e, domain, m: m / domain * chance(e, domain, m),  # Definition 2 as printed
-        lambda e, domain, m: chance(e + 0.02, domain, m),  # a little more than was promised
+        lambda e, domain, m: chance(e + 0.02, domain, m),  # a little above the guarantee
     ],
     ids=["larger K", "K for K - m", "k-RR", "printed", "epsilon + .02"],
 )
@@ -280,18 +281,21 @@ def test_control_a_wrong_p_fails(wrong: Callable[[float, int, int], float], size
 def test_control_others_that_may_be_the_true_word_fail() -> None:
     def unshifted(true: np.ndarray, domain: int, epsilon: float, size: int, rng: np.random.Generator) -> np.ndarray:
         """Draws the others from all of K where u = 0."""
-        told = draw_inclusion(len(true), epsilon, domain, size, rng)
+        included = draw_inclusion(len(true), epsilon, domain, size, rng)
         words = draw_word_subsets(true, domain, math.inf, size, rng)
-        words[~told] = draw_distinct(int((~told).sum()), domain, size, rng)
+        words[~included] = draw_distinct(int((~included).sum()), domain, size, rng)
         return words
 
     assert subsets_fit(unshifted, 6, 2, 1.0) < CERTAINLY_WRONG
 
 
-def sampled_ratio(epsilon: float, domain: int, size: int, told: Fraction) -> Fraction:
-    """Greatest Pr(Z | v1) / Pr(Z | v2) of the mechanism's steps: u with probability `told`, then a uniform set of others."""
+def sampled_ratio(epsilon: float, domain: int, size: int, included: Fraction) -> Fraction:
+    """Greatest Pr(Z | v1) / Pr(Z | v2) of the mechanism's steps: u with probability `included`, then a uniform set of others."""
     law = {
-        Z: [told / math.comb(domain - 1, size - 1) if v in Z else (1 - told) / math.comb(domain - 1, size) for v in range(domain)]
+        Z: [
+            included / math.comb(domain - 1, size - 1) if v in Z else (1 - included) / math.comb(domain - 1, size)
+            for v in range(domain)
+        ]
         for Z in combinations(range(domain), size)
     }
     assert all(sum(row[v] for row in law.values()) == 1 for v in range(domain))
@@ -300,27 +304,27 @@ def sampled_ratio(epsilon: float, domain: int, size: int, told: Fraction) -> Fra
 
 @pytest.mark.parametrize(("domain", "size", "epsilon"), [case for case in CASES if case[0] > case[1]])
 def test_ratio_of_any_two_words_is_e_to_the_epsilon_and_no_more(domain: int, size: int, epsilon: float) -> None:
-    told = Fraction(chance_digits(epsilon, domain, size, 256), 2**256)
+    included = Fraction(chance_digits(epsilon, domain, size, 256), 2**256)
     bounds = exp_bounds(Fraction(repr(epsilon)), 160)
-    assert abs(sampled_ratio(epsilon, domain, size, told) - bounds[0]) < Fraction(1, 2**200)
+    assert abs(sampled_ratio(epsilon, domain, size, included) - bounds[0]) < Fraction(1, 2**200)
 
 
 def test_control_a_ratio_of_a_wrong_p_exceeds_e_to_the_epsilon() -> None:
-    told = Fraction(chance(1.0, 6, 2)) + Fraction(1, 10**6)
-    assert sampled_ratio(1.0, 6, 2, told) > exp_bounds(Fraction(1), 60)[1]
+    included = Fraction(chance(1.0, 6, 2)) + Fraction(1, 10**6)
+    assert sampled_ratio(1.0, 6, 2, included) > exp_bounds(Fraction(1), 60)[1]
 
 
 def test_inclusion_at_full_size() -> None:
-    """At |K| = 256,000, ε = 10 and m = 2 the true word is told with probability .1468; all others are equally likely."""
+    """At |K| = 256,000, ε = 10 and m = 2 the true word is included with probability .1468; all others are equally likely."""
     domain, size, epsilon, draws = 256_000, 2, 10.0, 400_000
     rng = np.random.default_rng(0)
     true = rng.integers(domain, size=draws)
     words = draw_word_subsets(true, domain, epsilon, size, rng)
-    told = (words == true[:, None]).any(axis=1)
+    included = (words == true[:, None]).any(axis=1)
     expected = chance(epsilon, domain, size)
     assert expected == pytest.approx(0.1468, abs=1e-4)
-    assert stats.binomtest(int(told.sum()), draws, expected).pvalue > ALPHA
-    assert stats.binomtest(int(told.sum()), draws, chance(10.05, domain, size)).pvalue < ALPHA  # the control
+    assert stats.binomtest(int(included.sum()), draws, expected).pvalue > ALPHA
+    assert stats.binomtest(int(included.sum()), draws, chance(10.05, domain, size)).pvalue < ALPHA  # the control
     # The others' distance from the true word is uniform on 1 .. |K| − 1.
     distance = ((words - true[:, None]) % domain)[words != true[:, None]]
     assert distance.min() > 0
@@ -333,14 +337,14 @@ def test_inclusion_at_full_size() -> None:
 @given(domain=st.integers(1, 40), data=st.data())
 def test_distinct_numbers_are_distinct_and_in_range(domain: int, data: st.DataObject) -> None:
     size = data.draw(st.integers(0, domain))
-    drawn = draw_distinct(20, domain, size, np.random.default_rng(data.draw(st.integers(0, 2**32))))
-    assert drawn.shape == (20, size)
-    assert all(len(set(row)) == size for row in drawn.tolist())
-    assert size == 0 or (drawn.min() >= 0 and drawn.max() < domain)
+    numbers = draw_distinct(20, domain, size, np.random.default_rng(data.draw(st.integers(0, 2**32))))
+    assert numbers.shape == (20, size)
+    assert all(len(set(row)) == size for row in numbers.tolist())
+    assert size == 0 or (numbers.min() >= 0 and numbers.max() < domain)
 
 
 def test_more_distinct_numbers_than_there_are() -> None:
-    with pytest.raises(ValueError, match="3 distinct numbers were asked for, but there are 2"):
+    with pytest.raises(ValueError, match="cannot draw 3 distinct numbers from 2"):
         draw_distinct(1, 2, 3, np.random.default_rng(0))
 
 
@@ -361,12 +365,12 @@ def test_every_row_is_a_set_of_words(domain: int, epsilon: float, data: st.DataO
 
 
 def order_fits(sampler: Sampler, domain: int = 1000, size: int = 3) -> float:
-    """p-value of: where the true word is told, it stands in each place equally often. True words are uniform."""
+    """p-value of: where the true word is included, it has each position equally often. True words are uniform."""
     rng = np.random.default_rng(5)
     true = rng.integers(domain, size=200_000)
     words = sampler(true, domain, 5.0, size, rng)
-    places = np.nonzero(words == true[:, None])[1]
-    return float(stats.chisquare(np.bincount(places, minlength=size)).pvalue)
+    positions = np.nonzero(words == true[:, None])[1]
+    return float(stats.chisquare(np.bincount(positions, minlength=size)).pvalue)
 
 
 def test_order_carries_nothing() -> None:
@@ -380,7 +384,7 @@ def test_control_the_true_word_first_is_caught() -> None:
     assert order_fits(true_word_first) < CERTAINLY_WRONG
 
 
-# ---- how much a set tells
+# ---- mutual information
 
 
 @pytest.mark.parametrize(("domain", "size", "epsilon"), CASES)
@@ -397,28 +401,28 @@ def test_information_against_enumeration(domain: int, size: int, epsilon: float)
 def test_the_most_informative_size(domain: int, epsilon: float) -> None:
     best = most_informative_size(epsilon, domain)
     chance_true = [chance(epsilon, domain, m) for m in range(1, domain)] if epsilon < 30 else None
-    if chance_true is not None:  # by another route: I = H(Z) − H(Z | v) with logarithms of binomials left out
-        told = np.array(chance_true)
+    if chance_true is not None:  # independently: I = H(Z) − H(Z | v) without the logarithms of binomials
+        included = np.array(chance_true)
         m = np.arange(1, domain)
         with np.errstate(divide="ignore", invalid="ignore"):
-            tells = told * np.log(told / m * domain) + (1 - told) * np.log((1 - told) / (1 - m / domain))
-        assert best == 1 + int(np.nanargmax(tells))
+            information = included * np.log(included / m * domain) + (1 - included) * np.log((1 - included) / (1 - m / domain))
+        assert best == 1 + int(np.nanargmax(information))
     e = math.exp(epsilon)
     assert abs(best - max(1, domain * ((epsilon - 1) * e + 1) / (e - 1) ** 2)) <= 1
 
 
 def test_the_two_optima_at_full_size() -> None:
-    """|K| / (e^ε + 1) is not where mutual information is greatest: that is at nine times as many words."""
+    """Mutual information is greatest at about nine times |K| / (e^ε + 1)."""
     assert most_accurate_size(10.0, 256_000) == most_accurate_size(10.0, 262_144) == 12
     assert most_informative_size(10.0, 256_000) == 105
-    tells = mutual_information(10.0, 256_000, np.array([2, 12, 105]))
-    assert tells[2] > 1.5 * tells[1] > 4 * tells[0]
+    information = mutual_information(10.0, 256_000, np.array([2, 12, 105]))
+    assert information[2] > 1.5 * information[1] > 4 * information[0]
     assert most_informative_size(0.01, 1000) == pytest.approx(500, abs=3) == most_accurate_size(0.01, 1000)
     assert most_informative_size(math.inf, 1000) == 1
 
 
 def test_the_accurate_size_has_the_least_variance() -> None:
-    """Of the unbiased estimate of a rare word's frequency: q (1 − q) / (p − q)², q the rate of a word that is not true."""
+    """Of the unbiased estimate of a rare word's frequency: q (1 − q) / (p − q)², q the rate of a wrong word."""
 
     def variance(epsilon: float, domain: int, size: int) -> float:
         p = chance(epsilon, domain, size)
@@ -433,24 +437,27 @@ def test_the_accurate_size_has_the_least_variance() -> None:
 # ---- an independent implementation
 
 
+@pytest.mark.slow
 def test_inclusion_rates_against_multi_freq_ldpy() -> None:
-    """As sets; its order tells, which `test_audit.py` finds."""
+    """As sets; its order reveals the true word, as `test_audit.py` detects."""
     from multi_freq_ldpy.pure_frequency_oracles.SS import SS_Client
 
     domain, epsilon, true, rows = 64, 2.0, 20, 30_000
     size = most_accurate_size(epsilon, domain)
-    np.random.seed(1)  # noqa: NPY002  # what it draws from
+    np.random.seed(1)  # noqa: NPY002  # its source of randomness
     sets = np.stack([SS_Client.py_func(true, domain, epsilon) for _ in range(rows)])
     assert sets.shape == (rows, size)
     theirs = np.bincount(sets.ravel(), minlength=domain)
     rng = np.random.default_rng(2)
 
     def agree(ours: np.ndarray) -> float:
-        """The lesser p-value of: the true word is told as often; the others are told alike."""
-        mine = np.bincount(ours.ravel(), minlength=domain)
-        told = stats.chi2_contingency([[mine[true], rows - mine[true]], [theirs[true], rows - theirs[true]]], correction=False)
-        others = stats.chi2_contingency([np.delete(mine, true), np.delete(theirs, true)])
-        return min(told.pvalue, others.pvalue)
+        """The lesser p-value of: equal rates of the true word; equal rates of the others."""
+        counts = np.bincount(ours.ravel(), minlength=domain)
+        true_word = stats.chi2_contingency(
+            [[counts[true], rows - counts[true]], [theirs[true], rows - theirs[true]]], correction=False
+        )
+        others = stats.chi2_contingency([np.delete(counts, true), np.delete(theirs, true)])
+        return min(true_word.pvalue, others.pvalue)
 
     assert agree(draw_word_subsets(np.full(rows, true), domain, epsilon, size, rng)) > ALPHA
     assert agree(draw_word_subsets(np.full(rows, true), domain, epsilon + 0.1, size, rng)) < ALPHA  # the controls
@@ -491,12 +498,12 @@ def test_releases_words_and_nothing_of_the_secret(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.linalg.norm(release.candidates, axis=2), 1, atol=1e-6)
     assert (release.candidates.dtype, release.words.dtype) == (np.float32, np.int64)
     assert release.size == secret.size
-    kept = [array.copy() for array in (release.keypoints, release.candidates, release.words)]
+    copies = [array.copy() for array in (release.keypoints, release.candidates, release.words)]
     np.testing.assert_array_equal(release.keypoints, secret.keypoints)
     for array in (secret.keypoints, secret.descriptors, secret.codes, public.nearest_words(asset, secret), words):
         assert array is not None
         array[:] = 0
-    for before, after in zip(kept, (release.keypoints, release.candidates, release.words), strict=True):
+    for before, after in zip(copies, (release.keypoints, release.candidates, release.words), strict=True):
         np.testing.assert_array_equal(before, after)
 
 
@@ -520,7 +527,7 @@ def test_infinite_epsilon_is_quantisation(tmp_path: Path) -> None:
 
 
 def test_the_plugins_sets_against_enumeration(tmp_path: Path) -> None:
-    """The same χ² for what the plugin releases, true words of all kinds together."""
+    """The same χ² for the plugin's releases, over all true words."""
     asset = make_dictionary(tmp_path, 6)
     secret, public = make_features(20_000), Public()
     nearest = nearest_by_hand(secret, public.dictionary(asset).words)
@@ -569,7 +576,7 @@ def test_wrong_configuration(wrong: dict, message: str) -> None:
     assert str(caught.value) == message
 
 
-def test_a_dictionary_that_does_not_do(tmp_path: Path) -> None:
+def test_unsuitable_dictionaries(tmp_path: Path) -> None:
     small = LDP(dictionary=make_dictionary(tmp_path, 3), subset_size=4)
     for use in (
         lambda: small.privacy(Public()),
@@ -596,7 +603,7 @@ def test_floats_without_codes_are_quantised_too(tmp_path: Path) -> None:
     )
 
 
-def test_an_attacker_is_trained_for_what_is_served() -> None:
+def test_supported_settings_are_valid() -> None:
     rng = np.random.default_rng(0)
     for _ in range(20):
         LDP(**{name: setting.sample(rng) for name, setting in LDP.supported_settings.items()})
@@ -605,7 +612,7 @@ def test_an_attacker_is_trained_for_what_is_served() -> None:
     assert 5 not in LDP.supported_settings["subset_size"]
 
 
-# ---- memory
+# ---- memoization
 
 
 def repeating_features(count: int) -> Features:
@@ -613,17 +620,18 @@ def repeating_features(count: int) -> Features:
     return make_features(count).take(np.repeat(np.arange(count), 2))
 
 
-def test_equal_words_get_equal_answers_only_where_that_is_asked(tmp_path: Path) -> None:
+def test_equal_words_get_equal_answers_only_when_memoized(tmp_path: Path) -> None:
     asset, secret = make_dictionary(tmp_path, 300), repeating_features(60)
-    remembered = LDP(dictionary=asset, memoize=True).protect(secret, Public(), np.random.default_rng(0)).words
-    assert remembered is not None
-    np.testing.assert_array_equal(remembered[::2], remembered[1::2])
+    memoized = LDP(dictionary=asset, memoize=True).protect(secret, Public(), np.random.default_rng(0)).words
+    assert memoized is not None
+    np.testing.assert_array_equal(memoized[::2], memoized[1::2])
     forgotten = LDP(dictionary=asset).protect(secret, Public(), np.random.default_rng(0)).words
     assert forgotten is not None
     assert (forgotten[::2] != forgotten[1::2]).any(axis=1).sum() > 40
 
 
-def test_what_is_remembered_has_the_law_of_the_mechanism(tmp_path: Path) -> None:
+@pytest.mark.slow
+def test_memoized_answers_have_the_law_of_the_mechanism(tmp_path: Path) -> None:
     """Over devices, not over keypoints."""
     asset, public = make_dictionary(tmp_path, 6), Public()
     one, defense = make_features(1), LDP(dictionary=asset, epsilon=1.0, memoize=True)
@@ -638,11 +646,11 @@ def test_what_is_remembered_has_the_law_of_the_mechanism(tmp_path: Path) -> None
     assert stats.chisquare(observed, wrong).pvalue < ALPHA  # the control
 
 
-def test_a_defense_that_remembers_promises_something_else(tmp_path: Path) -> None:
+def test_a_memoized_defense_has_another_guarantee(tmp_path: Path) -> None:
     asset = make_dictionary(tmp_path, 300)
-    remembering, forgetful = (LDP(dictionary=asset, memoize=memoize) for memoize in (True, False))
-    assert (remembering.is_memoized(), forgetful.is_memoized()) == (True, False)
-    assert remembering.privacy(Public()).guarantee == "epsilon-ldp-by-word"
+    memoized, forgetful = (LDP(dictionary=asset, memoize=memoize) for memoize in (True, False))
+    assert (memoized.is_memoized(), forgetful.is_memoized()) == (True, False)
+    assert memoized.privacy(Public()).guarantee == "epsilon-ldp-by-word"
     assert forgetful.privacy(Public()).guarantee == "epsilon-ldp"
 
 
@@ -654,7 +662,7 @@ SPEEDS = [(2, 64, "seeded"), (2, 256_000, "seeded"), (2, 2**30, "seeded"), (12, 
 
 
 def works(size: int, domain: int, generator: str) -> dict[str, Callable[[], object]]:
-    """Sampling, and its floor: m + 1 random 64-bit words a descriptor."""
+    """Sampling, and its floor: m + 1 random 64-bit words per descriptor."""
     rng = protection.create_generator(bytes(32)) if generator == "cipher" else np.random.default_rng(0)
     true = np.random.default_rng(1).integers(domain, size=ROWS)
     return {
@@ -674,7 +682,7 @@ def test_speed_of_sampling(benchmark: Any, size: int, domain: int, generator: st
 @pytest.mark.benchmark
 @pytest.mark.parametrize(("size", "domain", "generator"), SPEEDS, ids=short)
 def test_sampling_takes_at_most_five_times_its_floor(benchmark: Any, size: int, domain: int, generator: str) -> None:
-    """In turn, and in time on the processor, so that what else runs on it counts little."""
+    """Alternating, in processor time, so that other processes have little effect."""
     seconds: dict[str, list[float]] = {}
 
     def both() -> None:

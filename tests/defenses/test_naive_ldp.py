@@ -1,4 +1,4 @@
-"""Naive LDP: the same mechanism on all bit patterns, of one byte against enumeration, of 128 and 512 bytes at the extremes."""
+"""Naive LDP: the mechanism on all bit patterns, of one byte against enumeration, of 128 and 512 bytes at the extremes."""
 
 import math
 from collections.abc import Callable
@@ -31,7 +31,7 @@ def make_features(count: int, seed: int = 0, codes: bool = True) -> Features:
 
 
 def draw_repeatedly(epsilon: float, count: int) -> np.ndarray:
-    """Where the descriptor is in its set, for many copies of one. -> (N, m) bool"""
+    """Whether each pattern of the sets is the descriptor, for many copies of one. -> (N, m) bool"""
     one = make_features(1)
     assert one.codes is not None
     many = Features(
@@ -72,16 +72,17 @@ def test_sets_of_bytes_against_enumeration(epsilon: float) -> None:
     assert pairs_fit(draw_pattern_subsets, epsilon) > ALPHA
 
 
+@pytest.mark.slow
 def test_control_an_approximate_domain_fails() -> None:
-    """Drawing u for |K| = 256 + 8 and, what the full space tempts to, p = m e^ε / |K|."""
+    """Drawing u for |K| = 256 + 8, and with the approximation p = m e^ε / |K|."""
 
     def sampler(domain: float) -> Sampler:
         def sample(true: np.ndarray, epsilon: float, size: int, rng: np.random.Generator) -> np.ndarray:
-            told = rng.random(len(true)) < size * math.exp(epsilon) / domain
+            included = rng.random(len(true)) < size * math.exp(epsilon) / domain
             drawn = np.empty((len(true), size, 1), dtype=np.uint8)
-            drawn[told] = draw_pattern_subsets(true[told], math.inf, size, rng)
-            # Sets without the true byte: of ε = 0, those that lack it.
-            rest = np.flatnonzero(~told)
+            drawn[included] = draw_pattern_subsets(true[included], math.inf, size, rng)
+            # Sets without the true byte: those of ε = 0 that lack it.
+            rest = np.flatnonzero(~included)
             while len(rest):
                 drawn[rest] = draw_pattern_subsets(true[rest], 0.0, size, rng)
                 rest = rest[(drawn[rest] == true[rest, None]).any(axis=(1, 2))]
@@ -90,7 +91,7 @@ def test_control_an_approximate_domain_fails() -> None:
         return sample
 
     total = 2 * math.exp(3.0) + 256 - 2
-    assert pairs_fit(sampler(total), 3.0) > ALPHA  # the right p, to show that nothing else is wrong
+    assert pairs_fit(sampler(total), 3.0) > ALPHA  # the right p: nothing else is wrong
     assert pairs_fit(sampler(total + 8), 3.0) < CERTAINLY_WRONG
     assert pairs_fit(sampler(256), 3.0) < CERTAINLY_WRONG
 
@@ -142,8 +143,8 @@ def test_order_carries_nothing_and_the_control_is_caught() -> None:
     drawn = draw_pattern_subsets(true, math.inf, 2, rng)
     first = (drawn[:, 0] == true).all(axis=1)
     assert stats.binomtest(int(first.sum()), len(true)).pvalue > ALPHA
-    told_first = np.concatenate([true[:, None], np.where((drawn == true[:, None]).all(2, keepdims=True), 0, drawn)], axis=1)
-    assert stats.binomtest(int((told_first[:, 0] == true).all(axis=1).sum()), len(true)).pvalue < CERTAINLY_WRONG
+    included_first = np.concatenate([true[:, None], np.where((drawn == true[:, None]).all(2, keepdims=True), 0, drawn)], axis=1)
+    assert stats.binomtest(int((included_first[:, 0] == true).all(axis=1).sum()), len(true)).pvalue < CERTAINLY_WRONG
 
 
 # ---- probabilities far beyond a double's range
@@ -153,39 +154,39 @@ def test_order_carries_nothing_and_the_control_is_caught() -> None:
 def test_chance_of_the_true_pattern_in_log_space(element: Any, bits: int) -> None:
     promised = NAIVE(element=element).privacy(Public())
     assert (promised.guarantee, promised.epsilon) == ("epsilon-ldp", 10.0)
-    expected = math.log10(2) + 10 / math.log(10) - bits * math.log10(2)  # m e^ε is nothing beside |K|
+    expected = math.log10(2) + 10 / math.log(10) - bits * math.log10(2)  # m e^ε is negligible against |K|
     assert promised.log10_true == pytest.approx(expected, abs=1e-9)
     assert promised.log10_true == pytest.approx({"uint8": -303.61, "float32": -1228.37}[element], abs=0.01)
 
 
-def test_infinite_epsilon_always_tells() -> None:
-    told = draw_repeatedly(math.inf, 50)
-    assert (told.sum(axis=1) == 1).all()
+def test_infinite_epsilon_always_includes_the_true_pattern() -> None:
+    included = draw_repeatedly(math.inf, 50)
+    assert (included.sum(axis=1) == 1).all()
     assert NAIVE(epsilon=math.inf).privacy(Public()) == Privacy("none", None, 0.0)
 
 
-def test_at_a_middling_chance_the_rate_is_right() -> None:
+def test_the_rate_at_a_chance_of_one_half() -> None:
     """ε = 709 is about where p is one half in 1024 bits: e^ε is near the greatest double and |K| near its double."""
-    told = draw_repeatedly(709.0, 5_000)
+    included = draw_repeatedly(709.0, 5_000)
     p = 1 / (1 + math.exp(1024 * math.log(2) - math.log(2) - 709))
     assert 0.4 < p < 0.6
     assert 10 ** NAIVE(epsilon=709.0).privacy(Public()).log10_true == pytest.approx(p, rel=1e-9)  # type: ignore[operator]
-    assert stats.binomtest(int(told.any(axis=1).sum()), len(told), p).pvalue > ALPHA
-    assert stats.binomtest(int(told.any(axis=1).sum()), len(told), p * 1.2).pvalue < ALPHA  # the control
-    places = told[told.any(axis=1)].argmax(axis=1)
-    assert stats.binomtest(int(places.sum()), len(places), told_behind_chance()).pvalue > ALPHA
+    assert stats.binomtest(int(included.any(axis=1).sum()), len(included), p).pvalue > ALPHA
+    assert stats.binomtest(int(included.any(axis=1).sum()), len(included), p * 1.2).pvalue < ALPHA  # the control
+    positions = included[included.any(axis=1)].argmax(axis=1)
+    assert stats.binomtest(int(positions.sum()), len(positions), compute_second_position_chance()).pvalue > ALPHA
 
 
-def told_behind_chance() -> float:
+def compute_second_position_chance() -> float:
     """Chance that the repeated descriptor's bytes come after a random pattern's."""
     codes = make_features(1).codes
     assert codes is not None
     return int.from_bytes(codes[0].tobytes(), "big") / 2**1024
 
 
-def test_at_epsilon_10_nothing_is_told() -> None:
-    told = draw_repeatedly(10.0, 5_000)
-    assert not told.any()
+def test_at_epsilon_10_the_true_pattern_is_never_included() -> None:
+    included = draw_repeatedly(10.0, 5_000)
+    assert not included.any()
     assert not draw_inclusion(10**5, 10.0, 2**4096, 2, np.random.default_rng(0)).any()
 
 
@@ -199,16 +200,16 @@ def test_candidates_are_finite_unit_rows(element: Any) -> None:
     assert release.words is None
     assert (release.candidates.shape, release.candidates.dtype) == ((300, 3, 128), np.float32)
     np.testing.assert_allclose(np.linalg.norm(release.candidates.astype(float), axis=2), 1, atol=1e-6)
-    kept = release.candidates.copy(), release.keypoints.copy()
+    copies = release.candidates.copy(), release.keypoints.copy()
     np.testing.assert_array_equal(release.keypoints, secret.keypoints)
     for array in (secret.keypoints, secret.descriptors, secret.codes):
         assert array is not None
         array[:] = 0
-    np.testing.assert_array_equal(release.candidates, kept[0])
-    np.testing.assert_array_equal(release.keypoints, kept[1])
+    np.testing.assert_array_equal(release.candidates, copies[0])
+    np.testing.assert_array_equal(release.keypoints, copies[1])
 
 
-def test_a_told_float_descriptor_comes_out_whole() -> None:
+def test_an_included_float_descriptor_is_unchanged() -> None:
     secret = make_features(20, codes=False)
     release = NAIVE(element="float32", epsilon=math.inf, subset_size=1).protect(secret, Public(), np.random.default_rng(0))
     np.testing.assert_allclose(release.candidates[:, 0], secret.descriptors, atol=1e-7)

@@ -1,4 +1,4 @@
-"""No defense: what goes in comes out, in memory of its own."""
+"""No defense: the features are released unchanged, in separate memory."""
 
 from typing import Any
 
@@ -22,21 +22,21 @@ def test_releases_the_descriptors_and_shares_no_memory() -> None:
     keypoints = rng.uniform(0, 64, (5, 2)).astype(np.float32)
     secret = Features(keypoints=keypoints, descriptors=descriptors, codes=None, size=(64, 48))
     release = PLUGIN().protect(secret, Public(), rng)
-    kept = descriptors.copy(), keypoints.copy()
+    copies = descriptors.copy(), keypoints.copy()
     descriptors[:] = 0
     keypoints[:] = 0
-    np.testing.assert_array_equal(release.descriptors, kept[0])
-    np.testing.assert_array_equal(release.keypoints, kept[1])
+    np.testing.assert_array_equal(release.descriptors, copies[0])
+    np.testing.assert_array_equal(release.keypoints, copies[1])
     assert release.size == (64, 48)
 
 
-def test_promises_nothing() -> None:
+def test_has_no_guarantee() -> None:
     assert PLUGIN().privacy(Public()) == Privacy("none")
     assert PLUGIN.name() == "none"
 
 
 @pytest.mark.parametrize(("sends", "columns"), [("positions", None), ("scale", 1), ("scale-and-orientation", 2)])
-def test_sends_of_a_keypoint_what_it_says(sends: Any, columns: int | None) -> None:
+def test_sends_the_configured_parts_of_a_keypoint(sends: Any, columns: int | None) -> None:
     secret = Sift(upright=False).extract(np.array(draw_texture(0, (256, 256))))
     release = PLUGIN(sends=sends).protect(secret, Public(), np.random.default_rng(0))
     if columns is None:
@@ -46,8 +46,8 @@ def test_sends_of_a_keypoint_what_it_says(sends: Any, columns: int | None) -> No
     assert not np.shares_memory(release.frames, secret.frames)
 
 
-def test_cannot_send_what_the_extractor_does_not_tell() -> None:
-    with pytest.raises(UserError, match="extractor does not tell"):
+def test_cannot_send_what_the_extractor_does_not_provide() -> None:
+    with pytest.raises(UserError, match="extractor does not provide"):
         PLUGIN(sends="scale").protect(draw_features(), Public(), np.random.default_rng(0))
 
 

@@ -27,7 +27,7 @@ ALPHA, CERTAINLY_WRONG = 1e-4, 1e-9
 
 
 def theorem(plateau: set[int], domain: int, epsilon: float, size: int) -> dict[tuple[int, ...], float]:
-    """Pr(Z | v) for all sets Z, by counting those that meet the plateau."""
+    """Pr(Z | v) for all sets Z, by counting those with a word of the plateau."""
     sets = list(combinations(range(domain), size))
     weights = [math.exp(epsilon) if plateau & set(Z) else 1.0 for Z in sets]
     return {Z: weight / sum(weights) for Z, weight in zip(sets, weights, strict=True)}
@@ -42,22 +42,23 @@ def test_sets_against_the_theorem(domain: int, size: int, near: int, epsilon: fl
     plateau = np.sort(np.random.default_rng(near).permutation(domain)[:near])
     drawn = draw_plateau_subsets(np.tile(plateau, (draws, 1)), domain, epsilon, size, np.random.default_rng(0))
     assert (np.diff(drawn, axis=1) > 0).all()
-    seen = Counter(map(tuple, drawn.tolist()))
+    observed = Counter(map(tuple, drawn.tolist()))
     expected = theorem(set(plateau.tolist()), domain, epsilon, size)
-    assert stats.chisquare([seen[Z] for Z in expected], [draws * chance for chance in expected.values()]).pvalue > ALPHA
+    assert stats.chisquare([observed[Z] for Z in expected], [draws * chance for chance in expected.values()]).pvalue > ALPHA
     if epsilon and near + size <= domain:
         control = theorem(set(plateau.tolist()), domain, epsilon + 0.4, size)
-        assert stats.chisquare([seen[Z] for Z in expected], [draws * chance for chance in control.values()]).pvalue < 1e-6
+        assert stats.chisquare([observed[Z] for Z in expected], [draws * chance for chance in control.values()]).pvalue < 1e-6
 
 
+@pytest.mark.slow
 def test_the_sampler_has_the_law_of_the_theorem() -> None:
-    """To within 2^-58, as the digits of p are: by playing all courses of its draws."""
+    """To within 2^-58, like the digits of p: by all sequences of its draws."""
     domain, size, epsilon = 5, 2, 1.0
-    meeting, every = math.comb(5, 2) - math.comb(3, 2), math.comb(5, 2)
-    p = Fraction(chance_digits(epsilon, every, meeting, 128), 2**128)
+    intersecting, every = math.comb(5, 2) - math.comb(3, 2), math.comb(5, 2)
+    p = Fraction(chance_digits(epsilon, every, intersecting, 128), 2**128)
     found = compute_law(lambda rng: tuple(draw_plateau_subsets(np.array([[1, 3]]), domain, epsilon, size, rng)[0].tolist()))
     for Z in combinations(range(domain), size):
-        expected = p / meeting if {1, 3} & set(Z) else (1 - p) / (every - meeting)
+        expected = p / intersecting if {1, 3} & set(Z) else (1 - p) / (every - intersecting)
         assert found.chances[Z] <= expected + Fraction(1, 2**120)
         assert expected <= found.at_most(Z) + Fraction(1, 2**120)
 
@@ -73,18 +74,18 @@ def test_a_plateau_of_one_is_ldp() -> None:
             assert abs(chance - laws[1].chances[Z]) < Fraction(1, 2**56)
 
 
-def test_near_words_are_told_nearly_as_often_as_the_true_one(tmp_path: Path) -> None:
+def test_near_words_are_released_nearly_as_often_as_the_true_one(tmp_path: Path) -> None:
     public, asset = Public(), write_dictionary(tmp_path, 400)
-    known = public.dictionary(asset)
+    loaded = public.dictionary(asset)
     secrets = create_features_near_words(LDP(dictionary=asset), public).take(np.full(4000, 17))
-    T = known.neighbours.find_nearest(np.array([17]), 4)[0]
+    T = loaded.neighbours.find_nearest(np.array([17]), 4)[0]
     release = Plateau(epsilon=4.0, near=4, dictionary=asset).protect(secrets, public, np.random.default_rng(0))
     rates = np.array([(release.words == word).any(axis=1).mean() for word in T])
-    promised = 10 ** (Plateau(epsilon=4.0, near=4, dictionary=asset).privacy(public).log10_true or 0)
-    np.testing.assert_allclose(rates, promised, atol=0.03)
+    chance_true = 10 ** (Plateau(epsilon=4.0, near=4, dictionary=asset).privacy(public).log10_true or 0)
+    np.testing.assert_allclose(rates, chance_true, atol=0.03)
     ldp = 10 ** (LDP(epsilon=4.0, dictionary=asset).privacy(public).log10_true or 0)
-    assert promised < ldp < rates.sum()
-    np.testing.assert_allclose(release.candidates, unit_rows(known.words[release.words]))
+    assert chance_true < ldp < rates.sum()
+    np.testing.assert_allclose(release.candidates, unit_rows(loaded.words[release.words]))
 
 
 def test_the_chance_of_the_true_word_against_the_theorem(tmp_path: Path) -> None:
@@ -98,11 +99,12 @@ def test_the_chance_of_the_true_word_against_the_theorem(tmp_path: Path) -> None
 # ---- the audit
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("defense", "words"),
     [(Plateau(epsilon=2.0), 64), (Plateau(epsilon=Exact("1/3"), subset_size=1, near=2), 4), (Plateau(epsilon=100.0), 64)],
 )
-def test_it_keeps_its_promise(defense: Plateau, words: int, tmp_path: Path) -> None:
+def test_the_guarantee_holds(defense: Plateau, words: int, tmp_path: Path) -> None:
     found = audit(defense, words, 10_000, 0, tmp_path)
     assert found.verdict != "violated"
     if defense.epsilon == 2.0:
@@ -114,17 +116,18 @@ def test_it_keeps_its_promise(defense: Plateau, words: int, tmp_path: Path) -> N
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class OneWordForAll(Plateau):
-    """Tells as often as a plateau of `near` words may, and always the true word."""
+    """Includes the true word as often as a plateau of `near` words may include any of them."""
 
     def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> WordSets:
-        known = public.dictionary(self.dictionary)
+        loaded = public.dictionary(self.dictionary)
         release = super().protect(secret, public, rng)
         true, words = public.nearest_words(self.dictionary, secret), release.words
         assert words is not None
-        met = (known.neighbours.find_nearest(true, self.near)[:, :, None] == words[:, None]).any(axis=(1, 2))
-        words[met & ~(words == true[:, None]).any(axis=1), 0] = true[met & ~(words == true[:, None]).any(axis=1)]
+        intersecting = (loaded.neighbours.find_nearest(true, self.near)[:, :, None] == words[:, None]).any(axis=(1, 2))
+        replaced = intersecting & ~(words == true[:, None]).any(axis=1)
+        words[replaced, 0] = true[replaced]
         words = np.sort(words, axis=1)
-        return dataclasses.replace(release, words=words, candidates=unit_rows(known.words[words]))
+        return dataclasses.replace(release, words=words, candidates=unit_rows(loaded.words[words]))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -132,20 +135,21 @@ class AsManyAsAreAlike(Plateau):
     """A plateau of more words for one half of the dictionary, so that normalisers differ."""
 
     def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> WordSets:
-        known = public.dictionary(self.dictionary)
+        loaded = public.dictionary(self.dictionary)
         words = np.empty((len(secret), self.subset_size), dtype=np.int64)
         for row, true in enumerate(public.nearest_words(self.dictionary, secret)):
-            plateau = known.neighbours.find_nearest(np.array([true]), self.near + 1 if true < len(known) // 2 else 1)
-            words[row] = draw_plateau_subsets(plateau, len(known), self.epsilon, self.subset_size, rng)[0]
+            plateau = loaded.neighbours.find_nearest(np.array([true]), self.near + 1 if true < len(loaded) // 2 else 1)
+            words[row] = draw_plateau_subsets(plateau, len(loaded), self.epsilon, self.subset_size, rng)[0]
         return WordSets(
             positions=Points(keypoints=secret.keypoints.copy()),
             size=secret.size,
-            candidates=unit_rows(known.words[words]),
+            candidates=unit_rows(loaded.words[words]),
             words=words,
         )
 
 
-def test_broken_ones_are_caught(tmp_path: Path) -> None:
+@pytest.mark.slow
+def test_broken_variants_are_detected(tmp_path: Path) -> None:
     found = audit(OneWordForAll(epsilon=2.0), 64, 20_000, 0, tmp_path)
     assert {finding.family for finding in found.findings if finding.certain_epsilon > 2.0} >= {"membership"}
     found = audit(AsManyAsAreAlike(epsilon=0.5, subset_size=1, near=2), 4, 400, 0, tmp_path)
@@ -153,7 +157,7 @@ def test_broken_ones_are_caught(tmp_path: Path) -> None:
     assert found.enumeration.exceeds
 
 
-# ---- what is asked
+# ---- configuration
 
 
 @pytest.mark.parametrize(

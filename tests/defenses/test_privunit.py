@@ -1,4 +1,4 @@
-"""PrivUnit against the law of its docstring: the coordinate along the descriptor, what is around it, and the best cap."""
+"""PrivUnit against the law of its docstring: the coordinate along the descriptor, the orthogonal part, and the best cap."""
 
 import dataclasses
 import math
@@ -26,7 +26,7 @@ def directions(count: int, length: int) -> np.ndarray:
 
 
 def test_quotient_of_densities_is_e_to_the_epsilon() -> None:
-    """p / q over (1 − p) / (1 − q), as fractions, to as many digits as are asked for."""
+    """p / q over (1 − p) / (1 − q), as exact fractions."""
     for epsilon in (0.5, 2.0, 10.0, 100.0):
         covered = choose_cap(epsilon, 127)
         p, q = Fraction(chance_digits(epsilon, 2**BINARY_DIGITS, covered, 512), 2**512), Fraction(covered, 2**BINARY_DIGITS)
@@ -55,9 +55,9 @@ def test_the_cap_is_the_best(epsilon: float, length: int) -> None:
 
 def test_the_coordinate_along_the_descriptor() -> None:
     rows, length, epsilon = 20_000, 24, 5.0
-    drawn = draw_near(directions(rows, length), None, epsilon, np.random.default_rng(1))
-    np.testing.assert_allclose(np.linalg.norm(drawn, axis=1), 1)
-    along = drawn @ directions(1, length)[0]
+    vectors = draw_near(directions(rows, length), None, epsilon, np.random.default_rng(1))
+    np.testing.assert_allclose(np.linalg.norm(vectors, axis=1), 1)
+    along = vectors @ directions(1, length)[0]
 
     def cumulative(x: np.ndarray, epsilon: float = epsilon) -> np.ndarray:
         q, half = choose_cap(epsilon, length) / 2**BINARY_DIGITS, (length - 1) / 2
@@ -70,12 +70,12 @@ def test_the_coordinate_along_the_descriptor() -> None:
     assert along.mean() == pytest.approx(expected_cosine(epsilon, length), abs=4 * along.std() / rows**0.5)
 
 
-def test_what_is_around_is_uniform() -> None:
+def test_the_orthogonal_part_is_uniform() -> None:
     rows, length = 20_000, 8
     u = directions(rows, length)
-    drawn = draw_near(u, None, 3.0, np.random.default_rng(2))
-    around = remove_mean(drawn - np.einsum("nd,nd->n", drawn, u)[:, None] * u, None)
-    frame = np.linalg.svd(u[:1])[2][1:]  # of what is at right angles to u
+    vectors = draw_near(u, None, 3.0, np.random.default_rng(2))
+    around = remove_mean(vectors - np.einsum("nd,nd->n", vectors, u)[:, None] * u, None)
+    frame = np.linalg.svd(u[:1])[2][1:]  # of the space orthogonal to u
     uniform = stats.beta((length - 2) / 2, (length - 2) / 2)
     for axis in frame:
         assert stats.kstest((1 + around @ axis) / 2, uniform.cdf).pvalue > ALPHA
@@ -89,8 +89,8 @@ def test_a_release_is_centred_and_on_the_grid(tmp_path: Path) -> None:
     assert np.abs(centred @ mean).max() < 40 * GRID
     whole = PrivUnit(epsilon=12.0, centred=False, dictionary=asset).protect(secret, public, np.random.default_rng(0)).descriptors
     assert (whole @ mean).std() > 0.05
-    told = remove_mean(secret.descriptors.astype(np.float64), mean[None])
-    cosines = np.einsum("nd,nd->n", centred, told)
+    secret_directions = remove_mean(secret.descriptors.astype(np.float64), mean[None])
+    cosines = np.einsum("nd,nd->n", centred, secret_directions)
     assert cosines.mean() == pytest.approx(expected_cosine(12.0, 127), abs=0.02)
     steps = np.abs(centred[0]) / np.diff(np.unique(np.abs(centred[0]))).min()  # differences are of whole steps
     assert len(np.unique(np.abs(centred[0]))) < 128
@@ -100,7 +100,8 @@ def test_a_release_is_centred_and_on_the_grid(tmp_path: Path) -> None:
 # ---- the audit
 
 
-def test_it_keeps_its_promise(tmp_path: Path) -> None:
+@pytest.mark.slow
+def test_the_guarantee_holds(tmp_path: Path) -> None:
     found = audit(PrivUnit(epsilon=2.0), 64, 8000, 0, tmp_path)
     assert found.verdict != "violated"
     assert found.strongest.family == "projection"
@@ -110,20 +111,21 @@ def test_it_keeps_its_promise(tmp_path: Path) -> None:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class AlwaysWithin(PrivUnit):
-    """Draws from the cap, and tosses no coin."""
+    """Always draws from the cap."""
 
     def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> Descriptors:
-        drawn = PrivUnit(epsilon=40.0, centred=self.centred, dictionary=self.dictionary).protect(secret, public, rng)
-        return dataclasses.replace(drawn)
+        vectors = PrivUnit(epsilon=40.0, centred=self.centred, dictionary=self.dictionary).protect(secret, public, rng)
+        return dataclasses.replace(vectors)
 
 
-def test_a_broken_one_is_caught(tmp_path: Path) -> None:
+@pytest.mark.slow
+def test_a_broken_variant_is_detected(tmp_path: Path) -> None:
     found = audit(AlwaysWithin(epsilon=2.0), 64, 8000, 0, tmp_path)
     assert found.verdict == "violated"
     assert {finding.family for finding in found.findings if finding.certain_epsilon > 2.0} == {"projection"}
 
 
-# ---- what is asked
+# ---- configuration
 
 
 @pytest.mark.parametrize("epsilon", [0.0, -1.0, math.inf, math.nan])
@@ -132,6 +134,6 @@ def test_mistakes(epsilon: float) -> None:
         PrivUnit(epsilon=epsilon)
 
 
-def test_it_is_matched_without_lowes_test() -> None:
+def test_matching_uses_no_ratio_test() -> None:
     assert map_matching.select_matcher(PrivUnit()) == "noisy-nn"
     assert map_matching.MATCHERS["noisy-nn"]().ratio == 1.0  # type: ignore[attr-defined]

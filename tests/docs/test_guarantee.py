@@ -1,4 +1,4 @@
-"""What docs/guarantee.md shows works as it stands there, and the numbers that it states are right."""
+"""The commands of docs/guarantee.md run, and its numbers are right."""
 
 import math
 import re
@@ -39,12 +39,12 @@ def test_commands_run(command: str, capfd: pytest.CaptureFixture[str]) -> None:
         assert "tight" in shown
 
 
-def test_the_line_of_python_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_python_line_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (line,) = re.findall(r"```python\n(.*?)\n```", PAGE, re.DOTALL)
     monkeypatch.chdir(tmp_path)
-    found: dict[str, object] = {"bench": bench, "LDP": LDP, "features": draw_features(20)}
-    exec(line, found)
-    assert len(found["release"]) == 20  # type: ignore[arg-type]
+    names: dict[str, object] = {"bench": bench, "LDP": LDP, "features": draw_features(20)}
+    exec(line, names)
+    assert len(names["release"]) == 20  # type: ignore[arg-type]
     assert (tmp_path / "device.key").is_file()
 
 
@@ -53,16 +53,16 @@ def test_numbers() -> None:
     words = len(shipped)
     assert words == 256_000
     assert f"{math.exp(10):,.0f} times" in PAGE
-    left = solve_epsilon(10.0, 1000)
-    assert f"About {left:.3f}: then" in PAGE
-    one_in = 2 / 10 ** log10_chance(left, words, 2)
+    descriptor_epsilon = solve_epsilon(10.0, 1000)
+    assert f"About {descriptor_epsilon:.3f}: then" in PAGE
+    one_in = 2 / 10 ** log10_chance(descriptor_epsilon, words, 2)
     assert f"one released word in {round(one_in, -3):,.0f} is the true one" in PAGE
     assert f"**{most_informative_size(10.0, words)}** of 256,000 words" in PAGE
     assert f"**{most_accurate_size(10.0, words)}** at the same point" in PAGE
 
 
-def test_what_sets_of_each_size_tell() -> None:
-    """Of the table of sizes: what does not rest on measurements."""
+def test_table_of_subset_sizes() -> None:
+    """Checks the columns that do not rest on measurements."""
     rows = re.findall(r"^\| (\d+)[^|]*\| ([\d.]+) \| ([\d.]+) \|", PAGE, re.MULTILINE)
     assert [int(size) for size, _, _ in rows] == [
         1,
@@ -73,18 +73,18 @@ def test_what_sets_of_each_size_tell() -> None:
         16,
         most_informative_size(6.534, 8000),
     ]
-    for size, told, bits in rows:
-        assert f"{10 ** log10_chance(6.534, 8000, int(size)):.3f}" == told
+    for size, chance, bits in rows:
+        assert f"{10 ** log10_chance(6.534, 8000, int(size)):.3f}" == chance
         assert f"{mutual_information(6.534, 8000, np.array([int(size)]))[0] / math.log(2):.2f}" == bits
 
 
-def test_how_much_trials_can_show() -> None:
-    """Of a defense that always tells its word and never another; half of the trials are measured."""
+def test_largest_bound_of_a_number_of_trials() -> None:
+    """For a defense that always releases its word and never another; half of the trials are measured."""
 
-    def most(trials: int) -> float:
+    def compute_bound(trials: int) -> float:
         return float(log_ratio(trials // 2, trials // 2, 0, trials // 2, 0.95))
 
     for trials in (10**4, 10**6, 10**8):
-        assert most(trials) == pytest.approx(math.log(trials) - 2, abs=0.01)
-    assert most(160_000) == pytest.approx(10, abs=0.02)
-    assert f"a million can show {most(10**6):.1f}" in PAGE
+        assert compute_bound(trials) == pytest.approx(math.log(trials) - 2, abs=0.01)
+    assert compute_bound(160_000) == pytest.approx(10, abs=0.02)
+    assert f"a million can show {compute_bound(10**6):.1f}" in PAGE

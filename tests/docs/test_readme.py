@@ -1,4 +1,4 @@
-"""What the README shows works as it stands there."""
+"""The code and the commands of the README work."""
 
 import re
 from pathlib import Path
@@ -28,7 +28,7 @@ def test_the_defense_in_twenty_lines(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("line", re.findall(r"^(?:\.venv/bin/)?bench (.+?)(?:\s+#.*)?$", README, re.MULTILINE))
-def test_commands_are_understood(line):
+def test_commands_are_parsed(line):
     args, extra = build_parser().parse_known_args(line.split())
     assert not extra
     assert all(getattr(args, option) for option in args.required)

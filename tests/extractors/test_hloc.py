@@ -53,14 +53,14 @@ def extract(path: Path, photograph: Path, **more: Any) -> Any:
     return Hloc(path=path, **more).extract(photographs.read(photograph).pixels, photograph)
 
 
-def test_what_is_declared_of_the_descriptors_decides_which_attacks_apply(tmp_path: Path) -> None:
+def test_declared_properties_of_descriptors_decide_which_attacks_apply(tmp_path: Path) -> None:
     path = features(tmp_path)
     for attack, declared in ((Sparsity(), {"exact_zeros": True}), (Lattice(), {"eight_bit": True})):
         assert "hloc does not declare" in (attack.explain_not_applicable(Affine(), Hloc(path=path), Public()) or "")
         assert attack.explain_not_applicable(Affine(), Hloc(path=path, **declared), Public()) is None
 
 
-def test_keypoints_follow_the_cut_and_the_scale(tmp_path: Path, photograph: Path) -> None:
+def test_keypoints_follow_crop_and_scale(tmp_path: Path, photograph: Path) -> None:
     found = extract(features(tmp_path), photograph)
     scale = 256 / HEIGHT  # the square is cut from x = 100 to x = 300
     expected = [[0.5 * scale, 0.5 * scale], [128, 128], [256 - 0.5 * scale, 256 - 0.5 * scale]]  # from top to bottom
@@ -116,7 +116,7 @@ def test_bad_features_are_explained(tmp_path: Path, photograph: Path, datasets: 
         extract(path, photograph)
 
 
-def test_other_lengths_are_asked_for(tmp_path: Path, photograph: Path) -> None:
+def test_other_descriptor_lengths_can_be_declared(tmp_path: Path, photograph: Path) -> None:
     path = features(tmp_path, descriptors=np.ones((256, 5)))
     assert extract(path, photograph, dimension=256).descriptors.shape == (3, 256)
 
@@ -129,7 +129,7 @@ def test_rotated_photograph_is_refused(tmp_path: Path) -> None:
         extract(features(tmp_path, "a.png"), tmp_path / "a.png")
 
 
-def test_bad_files_are_mistakes(tmp_path: Path, photograph: Path) -> None:
+def test_bad_files_are_refused(tmp_path: Path, photograph: Path) -> None:
     with pytest.raises(UserError, match="no such file"):
         Hloc(path=tmp_path / "absent.h5")
     with pytest.raises(UserError, match="not an HDF5 file"):

@@ -1,4 +1,4 @@
-"""SIFT: COLMAP's convention for keypoints, 8-bit codes, and what upright means."""
+"""SIFT: COLMAP's convention for keypoints, 8-bit codes, and upright orientation."""
 
 import cv2
 import numpy as np
@@ -14,8 +14,8 @@ def images():
     return [photographs.read(source.path).pixels for source in photographs.list_builtin()]
 
 
-def matched(one: np.ndarray, other: np.ndarray) -> float:
-    """Share of descriptors that have a near twin in the other image."""
+def compute_match_fraction(one: np.ndarray, other: np.ndarray) -> float:
+    """Compute the fraction of descriptors with a very similar one in the other image."""
     return float(((one @ other.T).max(axis=1) > 0.98).mean())
 
 
@@ -46,8 +46,8 @@ def test_upright_means_gravitys_orientation(images):
     """Turning the photograph by a right angle changes upright descriptors and leaves oriented ones as they are."""
     turned = np.ascontiguousarray(np.rot90(images[1]))
     oriented, upright = Sift(upright=False, max_keypoints=3000), Sift(max_keypoints=3000)
-    assert matched(oriented.extract(images[1]).descriptors, oriented.extract(turned).descriptors) > 0.7
-    assert matched(upright.extract(images[1]).descriptors, upright.extract(turned).descriptors) < 0.3
+    assert compute_match_fraction(oriented.extract(images[1]).descriptors, oriented.extract(turned).descriptors) > 0.7
+    assert compute_match_fraction(upright.extract(images[1]).descriptors, upright.extract(turned).descriptors) < 0.3
 
 
 def test_a_point_of_two_orientations_is_one_upright_point(images):
@@ -63,14 +63,15 @@ def test_about_600_to_1000_keypoints(images):
     assert max(counts) <= 1000
 
 
-def test_on_photographs_as_they_are_sent(shared_data):
-    """On the photographs that results are reported on, which the threshold was not chosen by."""
+@pytest.mark.slow
+def test_600_to_1000_keypoints_on_test_photographs(shared_data):
+    """On the photographs that results are reported on, which did not decide the threshold."""
     names = (shared_data / "test.txt").read_text().split()[::4]
     counts = [len(Sift().extract(photographs.read(shared_data / "train" / name).pixels)) for name in names]
     assert 600 <= np.median(counts) <= 1000
 
 
-def test_the_strongest_are_kept(images):
+def test_the_limit_selects_the_strongest(images):
     few, all_of_them = Sift(max_keypoints=100).extract(images[0]), Sift(max_keypoints=3000).extract(images[0])
     assert len(few) == 100
     assert {tuple(point) for point in few.keypoints} <= {tuple(point) for point in all_of_them.keypoints}
@@ -82,6 +83,6 @@ def test_a_flat_image_has_none():
 
 
 @pytest.mark.parametrize("wrong", [{"contrast_threshold": -1.0}, {"edge_threshold": 0.0}, {"max_keypoints": 0}])
-def test_settings_that_make_no_sense(wrong):
+def test_invalid_settings_are_refused(wrong):
     with pytest.raises(UserError, match="sift"):
         Sift(**wrong)

@@ -1,4 +1,4 @@
-"""To and from other programs: hloc, COLMAP, kornia, TensorBoard; and how MegaDepth and HPatches lie on disk."""
+"""Exchange with hloc, COLMAP, kornia and TensorBoard; the folders of MegaDepth and HPatches."""
 
 import builtins
 from pathlib import Path
@@ -29,7 +29,7 @@ kornia = pytest.importorskip("kornia")
 
 @pytest.fixture
 def images(tmp_path: Path) -> Path:
-    """Photographs that are no squares, in folders."""
+    """Photographs that are not square, in folders."""
     root = tmp_path / "photos"
     for number, name in enumerate(("street/a.png", "b.png")):
         (root / name).parent.mkdir(parents=True, exist_ok=True)
@@ -41,10 +41,10 @@ def export(*arguments: object) -> int:
     return cli.main(["export", *map(str, arguments)])
 
 
-# ---- where points lie
+# ---- coordinates
 
 
-def test_into_the_square_and_out_again(rng: np.random.Generator) -> None:
+def test_map_into_the_square_and_back(rng: np.random.Generator) -> None:
     points = rng.uniform(0, 300, (20, 2))
     for size in ((300, 200), (201, 300), (64, 64)):
         np.testing.assert_allclose(map_out_of_square(map_into_square(points, size, 256), size, 256), points)
@@ -53,7 +53,7 @@ def test_into_the_square_and_out_again(rng: np.random.Generator) -> None:
 # ---- hloc
 
 
-def test_features_for_hloc_are_those_that_come_back(images: Path, tmp_path: Path) -> None:
+def test_features_exported_to_hloc_are_read_again(images: Path, tmp_path: Path) -> None:
     out, pairs = tmp_path / "features.h5", tmp_path / "pairs.txt"
     assert export("--images", images, "--layout", "hloc", "--out", out, "--pairs", pairs) == 0
     path = images / "street" / "a.png"
@@ -70,7 +70,7 @@ def test_features_for_hloc_are_those_that_come_back(images: Path, tmp_path: Path
     assert hloc_pairs.read(pairs) == {"b.png": ["street/a.png"]}
 
 
-def test_of_a_set_each_word_is_written_and_of_a_subspace_what_is_recovered(
+def test_word_sets_export_all_candidates_and_subspaces_export_recovered_descriptors(
     images: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     ldp = f"ldp:epsilon=inf,subset_size=3,dictionary={write_dictionary(tmp_path)}"
@@ -93,7 +93,7 @@ def test_of_a_set_each_word_is_written_and_of_a_subspace_what_is_recovered(
     np.testing.assert_allclose(np.linalg.norm(rows, axis=1), 1, atol=1e-5)
 
 
-def test_mistakes_of_export(images: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_invalid_arguments_of_export(images: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     for arguments, complaint in (
         (("--layout", "hlco", "--out", tmp_path / "x"), "--layout hlco: unknown layout; available: hloc, colmap"),
         (("--layout", "hloc", "--out", images / "b.png"), "exists already"),
@@ -107,7 +107,7 @@ def test_mistakes_of_export(images: Path, tmp_path: Path, capfd: pytest.CaptureF
 # ---- COLMAP
 
 
-def test_database_for_colmap_is_read_by_colmap_and_by_us(images: Path, tmp_path: Path) -> None:
+def test_exported_database_is_read_by_colmap_and_by_us(images: Path, tmp_path: Path) -> None:
     out = tmp_path / "database.db"
     assert export("--images", images, "--layout", "colmap", "--out", out) == 0
     path = images / "street" / "a.png"
@@ -128,8 +128,8 @@ def test_database_for_colmap_is_read_by_colmap_and_by_us(images: Path, tmp_path:
     check_extractor(ColmapDatabase(path=out), pixels, path)
 
 
-def test_what_colmap_extracted_is_read(tmp_path: Path) -> None:
-    """An independent writer: COLMAP's own SIFT."""
+def test_features_of_colmap_are_read(tmp_path: Path) -> None:
+    """The file is written by COLMAP's own SIFT."""
     root = write_album(tmp_path / "photos", 1)
     draw_texture(5, (256, 256)).save(root / "0.png")
     out = tmp_path / "database.db"
@@ -143,7 +143,7 @@ def test_what_colmap_extracted_is_read(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.keypoints, xy[np.lexsort((xy[:, 0], xy[:, 1]))], atol=1e-4)
 
 
-def test_databases_that_cannot_serve(images: Path, tmp_path: Path) -> None:
+def test_unusable_databases(images: Path, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="no such file"):
         ColmapDatabase(path=tmp_path / "absent.db")
     with pytest.raises(UserError, match="not a COLMAP database"):
@@ -164,7 +164,7 @@ def test_databases_that_cannot_serve(images: Path, tmp_path: Path) -> None:
 # ---- layouts of photographs
 
 
-def test_of_megadepth_the_photographs_are_taken(tmp_path: Path) -> None:
+def test_photographs_of_megadepth(tmp_path: Path) -> None:
     scene = tmp_path / "phoenix" / "S6" / "zl548" / "MegaDepth_v1" / "0000"
     for name in ("dense0/imgs/a.jpg", "dense1/imgs/b.jpg", "dense0/depths/a.png"):
         (scene / name).parent.mkdir(parents=True, exist_ok=True)
@@ -174,7 +174,7 @@ def test_of_megadepth_the_photographs_are_taken(tmp_path: Path) -> None:
     assert found[0].name == "S6/zl548/MegaDepth_v1/0000/dense0/imgs/a.jpg"
 
 
-def test_of_hpatches_every_image_is_taken(tmp_path: Path) -> None:
+def test_photographs_of_hpatches(tmp_path: Path) -> None:
     for sequence in ("i_dome", "v_wall"):
         (tmp_path / sequence).mkdir()
         for number in range(1, 7):
@@ -190,7 +190,7 @@ def test_of_hpatches_every_image_is_taken(tmp_path: Path) -> None:
 
 @pytest.fixture
 def weights(tmp_path: Path) -> Path:
-    """A file as kornia keeps it, of random weights."""
+    """Random weights in a file of kornia's format."""
     torch.manual_seed(0)
     path = tmp_path / "hub" / "checkpoints" / f"hardnet--{WEIGHTS}"
     path.parent.mkdir(parents=True)
@@ -198,7 +198,7 @@ def weights(tmp_path: Path) -> Path:
     return path
 
 
-def test_hardnet_keeps_the_contract_and_describes_as_kornia_does(weights: Path) -> None:
+def test_hardnet_satisfies_the_contract_and_agrees_with_kornia(weights: Path) -> None:
     image = np.asarray(draw_texture(0, (256, 256)))
     extractor = HardNet(weights=weights, max_keypoints=20)
     check_extractor(extractor, image)
@@ -220,7 +220,7 @@ def test_hardnet_keeps_the_contract_and_describes_as_kornia_does(weights: Path) 
     np.testing.assert_allclose(found.descriptors, reference, atol=1e-4)
 
 
-def test_hardnet_looks_where_torch_hub_keeps_it(weights: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_hardnet_finds_the_weights_of_torch_hub(weights: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path / "hub"))
     assert HardNet(weights=Path("hub")).weights == weights
     weights.unlink()
@@ -234,15 +234,15 @@ def test_hardnet_without_weights_or_kornia(weights: Path, tmp_path: Path, monkey
     (tmp_path / "other.pth").write_bytes(b"something else")
     with pytest.raises(UserError, match="not kornia's"):
         HardNet(weights=tmp_path / "other.pth").extract(np.asarray(draw_texture(0, (256, 256))))
-    without(monkeypatch, "kornia")
+    hide_package(monkeypatch, "kornia")
     draw_texture(0).save(tmp_path / "a.png")
     moved = weights.rename(tmp_path / "moved.pth")
     with pytest.raises(UserError, match="hardnet needs kornia: pip install"):
         HardNet(weights=moved).extract(np.asarray(Image.open(tmp_path / "a.png")))
 
 
-def without(monkeypatch: pytest.MonkeyPatch, package: str) -> None:
-    """As if a package were not installed."""
+def hide_package(monkeypatch: pytest.MonkeyPatch, package: str) -> None:
+    """Make the import of a package fail."""
     imported = builtins.__import__
 
     def refuse(name: str, *more: Any) -> Any:
@@ -256,7 +256,7 @@ def without(monkeypatch: pytest.MonkeyPatch, package: str) -> None:
 # ---- TensorBoard
 
 
-def test_training_tells_tensorboard(tmp_path: Path) -> None:
+def test_training_writes_to_tensorboard(tmp_path: Path) -> None:
     events = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
     from bench.inversion.log import Log
 
@@ -270,7 +270,9 @@ def test_training_tells_tensorboard(tmp_path: Path) -> None:
     Log(None).add_scalars({"loss": 1.0}, 1)
 
 
-def test_no_tensorboard_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
+def test_missing_tensorboard_gives_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
     import sys
 
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)  # an import of it fails

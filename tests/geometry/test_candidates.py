@@ -1,4 +1,4 @@
-"""Which of several candidates is taken for the descriptor."""
+"""Selection of the descriptor among several candidates."""
 
 import numpy as np
 
@@ -32,12 +32,12 @@ def test_a_word_of_two_keypoints_comes_last():
     assert select_descriptors(owners, candidates, 3).tolist() == [1, 3, 4]
 
 
-def test_a_word_found_twice_at_one_keypoint_does_not_recur():
+def test_a_word_twice_at_one_keypoint_does_not_recur():
     owners = np.array([0, 0, 1])
     assert not find_recurring(owners, rows(CUT, CUT, PLAIN)).any()
 
 
-def test_a_word_of_two_keypoints_is_taken_where_there_is_no_other():
+def test_a_word_of_two_keypoints_is_selected_without_alternative():
     assert select_descriptors(np.array([0, 1]), rows(SHARED, SHARED), 2).tolist() == [0, 1]
 
 

@@ -1,4 +1,4 @@
-"""Distances of all pairs against least squares, one pair after the other."""
+"""Distances of all pairs against least squares per pair."""
 
 import numpy as np
 import pytest
@@ -57,7 +57,7 @@ def test_mutually_nearest_against_loops(rng: np.random.Generator, ratio: float) 
     assert 0 < len(expected) < 30
 
 
-def test_nothing_is_nearest_to_nothing() -> None:
+def test_empty_and_single_distances() -> None:
     for shape in ((0, 3), (3, 0)):
         rows, columns = find_mutual_nearest(torch.zeros(shape))
         assert len(rows) == len(columns) == 0

@@ -1,4 +1,4 @@
-"""Where subspaces meet, against least squares in float64; and the words that are rebuilt from there."""
+"""Intersections of subspaces against least squares in float64, and database reconstruction."""
 
 import numpy as np
 import pytest
@@ -33,7 +33,7 @@ def measure_distance(one: Subspaces, i: int, other: Subspaces, j: int) -> float:
 
 
 @pytest.mark.parametrize("dim", [2, 4, 16])
-def test_finds_the_pairs_that_least_squares_finds(database, dim):
+def test_intersecting_pairs_against_least_squares(database, dim):
     one, other = release_features(database, dim, 1), release_features(database, dim, 2, 9)
     distances = np.array([[measure_distance(one, i, other, j) for j in range(9)] for i in range(12)])
     expected = {(int(i), int(j)) for i, j in np.argwhere(distances < INTERSECTION_DISTANCE)}
@@ -42,13 +42,13 @@ def test_finds_the_pairs_that_least_squares_finds(database, dim):
     assert 0 < len(expected) < 12 * 9
     assert (
         distances[distances > INTERSECTION_DISTANCE].min() > 100 * INTERSECTION_DISTANCE
-    )  # zero is told from small with room to spare
+    )  # zero and small distances are well separated
 
 
-def test_subspaces_of_other_databases_do_not_meet(database, tmp_path):
+def test_subspaces_of_other_databases_do_not_intersect(database, tmp_path):
     """Negative control."""
-    strange = write_dictionary(tmp_path, 24, seed=9)
-    assert len(find_intersections(release_features(database, 4, 1), release_features(strange, 4, 2))) == 0
+    other_database = write_dictionary(tmp_path, 24, seed=9)
+    assert len(find_intersections(release_features(database, 4, 1), release_features(other_database, 4, 2))) == 0
 
 
 def test_pairs_within_a_release_come_once(database):
@@ -59,21 +59,21 @@ def test_pairs_within_a_release_come_once(database):
     assert (within.first < within.second).all()
 
 
-def test_two_liftings_of_one_descriptor_meet_in_it(database):
+def test_two_liftings_of_one_descriptor_intersect_in_it(database):
     defense, secret = Affine(dim=6, sub_databases=1, database=database), draw_features(30, 3)
     one, other = (defense.protect(secret, Public(), np.random.default_rng(seed)) for seed in (1, 2))
     points, distances, single = find_nearest_points(one, other)
     assert (distances < INTERSECTION_DISTANCE).all()
-    assert single.mean() > 0.5  # some share a word, too, and then a line
+    assert single.mean() > 0.5  # others share a word, and so a line
     np.testing.assert_allclose(points[single], secret.descriptors[single], atol=1e-5)
 
 
-def test_words_are_rebuilt_to_the_last_bit(database):
+def test_words_are_reconstructed_exactly(database):
     words = Public().dictionary(database).words
     found = reconstruct_database(find_intersections_within(release_features(database, 4, 1, 60)))
-    known = {row.tobytes() for row in words // np.gcd.reduce(words.astype(np.int64), axis=1)[:, None].astype(np.uint8)}
+    words_by_bytes = {row.tobytes() for row in words // np.gcd.reduce(words.astype(np.int64), axis=1)[:, None].astype(np.uint8)}
     assert len(found) > 20
-    assert all(row.tobytes() in known for row in found)
+    assert all(row.tobytes() in words_by_bytes for row in found)
 
 
 def test_points_that_are_no_words_are_left_out(rng):
@@ -84,7 +84,7 @@ def test_points_that_are_no_words_are_left_out(rng):
     assert len(find_byte_vectors(points + rng.normal(0, 1e-3, points.shape))) == 0
 
 
-def test_more_words_are_rebuilt_from_more_photographs(tmp_path):
+def test_more_photographs_reconstruct_more_words(tmp_path):
     path = tmp_path / "W.safetensors"
     dictionary.save(path, draw_features(400, 5).codes, {"photographs": []})
     parts = [release_features(Asset(path), 4, seed, 30) for seed in range(8)]

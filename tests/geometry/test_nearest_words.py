@@ -38,7 +38,8 @@ def test_agrees_with_faiss_on_floats(rng, words):
     assert (nearest_rows(queries, words) == index.search(unit_rows(queries), 1)[1][:, 0]).mean() > 0.99  # float32's ties aside
 
 
-def test_words_that_bf16_cannot_tell_apart(rng):
+@pytest.mark.slow
+def test_words_that_bf16_cannot_distinguish(rng):
     """Words that differ by one step in one component: only an exact comparison finds the right one."""
     base = rng.integers(100, 156, 128, dtype=np.uint8)
     words = np.repeat(base[None], 4096, axis=0)
@@ -47,6 +48,7 @@ def test_words_that_bf16_cannot_tell_apart(rng):
     assert np.array_equal(nearest_rows(queries, words), brute_force(queries, words))
 
 
+@pytest.mark.slow
 def test_without_a_margin_it_would_be_wrong(rng, monkeypatch):
     """Negative control of the tests above: the first pass alone does not decide."""
     base = rng.integers(0, 120, 128)
@@ -60,7 +62,7 @@ def test_without_a_margin_it_would_be_wrong(rng, monkeypatch):
 
 
 def test_ties_go_to_the_lowest_index(words):
-    doubled = np.concatenate([words, words])  # each word stands twice, in different blocks
+    doubled = np.concatenate([words, words])  # each word occurs twice, in different blocks
     found = nearest_rows(words[:300], doubled)
     assert (found < len(words)).all()
 

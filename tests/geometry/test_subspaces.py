@@ -1,4 +1,4 @@
-"""The words nearest to subspaces, against least squares in float64; and what the search costs beside a bare matrix product."""
+"""The words nearest to subspaces against least squares in float64; the search time against a bare matrix product."""
 
 import timeit
 from collections.abc import Callable
@@ -28,7 +28,7 @@ def build_subspaces(origins: np.ndarray, bases: np.ndarray) -> Subspaces:
 
 
 def draw_subspaces(rng: np.random.Generator, count: int, dim: int, length: int = 128) -> Subspaces:
-    """Subspaces about as far from zero as those of unit descriptors."""
+    """Draw subspaces about as far from zero as those of unit descriptors."""
     bases = np.linalg.qr(rng.normal(size=(count, length, dim)))[0].transpose(0, 2, 1)
     return build_subspaces(rng.normal(size=(count, length)) / length**0.5, bases)
 
@@ -53,13 +53,13 @@ def agree(release: Subspaces, words: np.ndarray, count: int) -> bool:
 
 @pytest.fixture
 def words(rng):
-    """As SIFT's: few large components, many near zero."""
+    """Like SIFT's: few large components, many near zero."""
     return np.minimum(rng.gamma(0.6, 40.0, (5000, 128)) + 1, 255).astype(np.uint8)
 
 
 @pytest.fixture(params=[torch.bfloat16, torch.float32], ids=["bf16", "float32"])
 def fast_pass(request, monkeypatch):
-    """Both formats of the fast pass, whatever this processor prefers."""
+    """Both formats of the fast pass, on any processor."""
     monkeypatch.setattr(subspaces, "pick_dtype", lambda device: request.param)
 
 
@@ -98,7 +98,7 @@ def test_no_subspaces(rng, words):
 
 
 def test_ties_go_to_the_lowest_index(rng, words):
-    doubled = np.concatenate([words, words[::-1], words])  # each word stands thrice, in different blocks
+    doubled = np.concatenate([words, words[::-1], words])  # each word occurs three times, in different blocks
     found, measured = find_nearest_to_subspaces(draw_subspaces(rng, 20, 4), doubled, 6)
     last = len(words) - 1
     twins = np.stack([found[:, ::3], 2 * last + 1 - found[:, ::3], found[:, ::3] + 2 * last + 2], axis=2).reshape(20, 6)
@@ -107,8 +107,8 @@ def test_ties_go_to_the_lowest_index(rng, words):
     np.testing.assert_allclose(measured[:, ::3], measured[:, 2::3], atol=ROUNDING)
 
 
-def test_zero_is_told_from_small(rng):
-    """Two words at 1e-7 from D and two in it: the fast pass cannot tell them apart, and the order is exact."""
+def test_zero_and_small_distances_are_distinguished(rng):
+    """Two words at 1e-7 from D and two in it: the fast pass cannot distinguish them, and the order is exact."""
     length, dim = 128, 4
     bases = np.zeros((1, dim, length))
     bases[0, np.arange(dim), np.arange(dim)] = 1  # D = the first four axes, shifted by 1/2 along the fifth
@@ -128,7 +128,7 @@ def test_zero_is_told_from_small(rng):
 
 
 def test_words_of_a_lifted_photograph_are_found_at_zero(rng, words):
-    """What the database attack rests on: rounding to float32 leaves the adversarial words far nearer than all others."""
+    """The basis of the database attack: after rounding to float32, adversarial words are still far nearer than all others."""
     d = unit_rows(words[:30])
     origins, bases = reparameterise(d.astype(float), lift(d.astype(float), words[1000:], 4, 8, rng)[0], rng)
     _, measured = find_nearest_to_subspaces(build_subspaces(origins, bases), words[1000:], 5)
@@ -140,7 +140,7 @@ def test_words_of_a_lifted_photograph_are_found_at_zero(rng, words):
 
 
 def scores_and_bound(release: Subspaces, words: np.ndarray, dtype: torch.dtype) -> tuple[np.ndarray, np.ndarray]:
-    """How far the fast pass errs, and how far it may. -> (N, K), (N,)"""
+    """Errors of the fast pass and their bounds. -> (N, K), (N,)"""
     feet, frames = feet_and_frames(release)
     exact = np.concatenate([feet[:, None], frames], axis=1).transpose(1, 0, 2)
     planes = torch.from_numpy(exact).to(dtype)
@@ -149,6 +149,7 @@ def scores_and_bound(release: Subspaces, words: np.ndarray, dtype: torch.dtype) 
     return np.abs(fast - true), subspaces._bound_error(exact, planes.double().numpy(), dtype, words.dtype)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float32])
 @pytest.mark.parametrize("kind", [np.uint8, np.float32])
 @pytest.mark.parametrize("dim", [1, 16])
@@ -157,6 +158,7 @@ def test_the_fast_pass_errs_within_its_bound(rng, words, dtype, kind, dim):
     assert (wrong <= bound[:, None]).all()
 
 
+@pytest.mark.slow
 def test_without_the_bound_it_would_be_wrong(rng, words, monkeypatch):
     """Negative control of the tests above: the fast pass alone does not decide."""
     monkeypatch.setattr(subspaces, "pick_dtype", lambda device: torch.bfloat16)
@@ -179,7 +181,7 @@ def test_projection_is_the_nearest_point(rng):
 # ---- speed: 2·N·(dim + 1)·K·D operations
 
 SUBSPACES, WORDS, NEAREST = 200, 65_536, 8
-# Times a bare float32 product: what a search that is blocked to the cache took.
+# Times a bare float32 product: measured with a search blocked to the cache.
 ENOUGH = {2: 2.9, 16: 1.6}
 
 by_dim = pytest.mark.parametrize(
@@ -189,7 +191,7 @@ by_dim = pytest.mark.parametrize(
 
 @pytest.fixture(scope="module")
 def lifted() -> Callable[[int], tuple[Subspaces, np.ndarray]]:
-    """A photograph's first keypoints as they are released, and words of the shipped database."""
+    """The release of a photograph's first keypoints, and words of the shipped database."""
 
     def lift_to(dim: int) -> tuple[Subspaces, np.ndarray]:
         features = Sift().extract(photographs.read(photographs.list_builtin()[0].path).pixels)

@@ -1,4 +1,4 @@
-"""Records that are made up for tests of what is made from records."""
+"""Fabricated records, for tests of the leaderboard."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -25,7 +25,7 @@ def ldp(epsilon: float) -> dict[str, Any]:
 
 
 def record(
-    unit: str,
+    sample: str,
     metrics: dict[str, Any],
     *,
     defense: dict[str, Any],
@@ -40,8 +40,8 @@ def record(
     settings: dict[str, Any] = SETTINGS,
     **more: Any,
 ) -> dict[str, Any]:
-    """One record, as the runner writes it."""
-    cell = experiment_id({"name": task, **task_settings}, defense, attack, dataset, seed, settings)
+    """Return one record as the runner writes it."""
+    identifier = experiment_id({"name": task, **task_settings}, defense, attack, dataset, seed, settings)
     epsilon = defense.get("epsilon")
     keypoints = metrics.get("keypoints", 100) if status == "ok" else None
     return seal(
@@ -54,10 +54,10 @@ def record(
             "task_settings": dict(task_settings),
             "metric_settings": settings,
             "seed": seed,
-            "experiment_id": cell,
-            "run_hash": run_hash(cell, environment),
+            "experiment_id": identifier,
+            "run_hash": run_hash(identifier, environment),
             "environment": environment,
-            "sample": unit,
+            "sample": sample,
             "status": status,
             "reason": reason,
             "metrics": metrics,
@@ -82,7 +82,7 @@ def record(
 
 
 def reconstructions(defense: dict[str, Any], scores: Sequence[float], **more: Any) -> list[dict[str, Any]]:
-    """One record for each score, which is an SSIM; units 0.png, 1.png, ..."""
+    """Return one record for each score, an SSIM, of the samples 0.png, 1.png, ..."""
     return [
         record(
             f"{number}.png", {"ssim": score, "mae": round(0.6 - score / 2, 4), "keypoints": 100 + number}, defense=defense, **more
@@ -92,13 +92,13 @@ def reconstructions(defense: dict[str, Any], scores: Sequence[float], **more: An
 
 
 def localizations(
-    defense: dict[str, Any], found: Sequence[int], conditions: Sequence[str | None], **more: Any
+    defense: dict[str, Any], hits: Sequence[int], conditions: Sequence[str | None], **more: Any
 ) -> list[dict[str, Any]]:
-    """One record for each query: whether it is localized, and under which condition."""
+    """Return one record for each query: whether it is localized, and under which condition."""
     given = {"task": "localization", "attack": None, "dataset": GALLERY} | more
     return [
-        record(f"query/{number}.jpg", _localized(hit), defense=defense, condition=condition, **given)
-        for number, (hit, condition) in enumerate(zip(found, conditions, strict=True))
+        record(f"query/{number}.jpg", _build_metrics(hit), defense=defense, condition=condition, **given)
+        for number, (hit, condition) in enumerate(zip(hits, conditions, strict=True))
     ]
 
 
@@ -107,7 +107,7 @@ def inapplicable(defense: dict[str, Any], attack: dict[str, Any], reason: str, *
 
 
 def write(folder: Path, records: Sequence[dict[str, Any]]) -> Path:
-    """A folder as `bench run` leaves it, with a picture for each reconstruction and each photograph."""
+    """Write the records into a folder as `bench run` does."""
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / FILE).open("w") as file:
         for one in records:
@@ -116,7 +116,7 @@ def write(folder: Path, records: Sequence[dict[str, Any]]) -> Path:
 
 
 def draw_picture(path: Path, seed: int) -> Path:
-    """A smooth picture."""
+    """Write a smooth random image."""
     path.parent.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng(seed)
     coarse = Image.fromarray(rng.integers(0, 256, (6, 6, 3), dtype=np.uint8))
@@ -124,7 +124,7 @@ def draw_picture(path: Path, seed: int) -> Path:
     return path
 
 
-def _localized(hit: int) -> dict[str, Any]:
+def _build_metrics(hit: int) -> dict[str, Any]:
     return {
         "recall_0.25m_2deg": float(hit),
         "recall_0.5m_5deg": float(hit),

@@ -20,12 +20,12 @@ from bench.images.scene import File, Reference, Scene, SceneImage
 from bench.runner.plan import Describe, Plan, RunConfiguration, build_plan, cross
 from bench.runner.trial import dry_run
 from bench.task_api import Task, Trial
-from bench.testing import NO_SAMPLE, shot
+from bench.testing import EMPTY_SAMPLE, build_image
 from bench.types import Features, Release
 
 FAKES = {
     "feature_privacy.attacks": {
-        "painter": "fake_plugins.painter:PLUGIN",
+        "sketch": "fake_plugins.sketch:PLUGIN",
         "guess": "fake_plugins.guess:PLUGIN",
         "fatal": "fake_plugins.fatal:PLUGIN",
         "glimpse": "fake_plugins.glimpse:PLUGIN",
@@ -89,8 +89,8 @@ def build_trial(
     """A trial of a task that judges the release itself, of features without a photograph."""
     public = Public()
     return Trial(
-        sample=NO_SAMPLE,
-        images=(shot(secret, defense.protect(secret, public, np.random.default_rng(1))),),
+        sample=EMPTY_SAMPLE,
+        images=(build_image(secret, defense.protect(secret, public, np.random.default_rng(1))),),
         defense=defense,
         attack=None,
         extractor=Sift(),

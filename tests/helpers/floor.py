@@ -1,4 +1,4 @@
-"""The floor of a search's time: its matrix product and nothing else."""
+"""The floor of a search's time: its matrix product alone."""
 
 from collections.abc import Callable
 
@@ -9,7 +9,7 @@ from bench.geometry.nearest_words import BLOCK, unit_rows
 
 
 def build_bare_product(rows: int, words: np.ndarray, dtype: torch.dtype) -> Callable[[], None]:
-    """Multiplies (rows, D) numbers by (K, D) words in blocks that stay in the cache."""
+    """Build a function that multiplies (rows, D) numbers by (K, D) words in blocks that stay in the cache."""
     factor = torch.randn(rows, words.shape[1]).to(dtype)
     blocks = torch.from_numpy(unit_rows(words)).to(dtype).split(BLOCK)
     out = factor.new_empty(rows, BLOCK)

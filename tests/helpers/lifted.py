@@ -18,8 +18,8 @@ from defenses.affine import Affine
 
 def extract_sift(count: int, photograph: int = 0) -> Features:
     """The first keypoints of a built-in photograph."""
-    found = Sift().extract(photographs.read(photographs.list_builtin()[photograph].path).pixels)
-    return found.take(np.arange(count))
+    features = Sift().extract(photographs.read(photographs.list_builtin()[photograph].path).pixels)
+    return features.take(np.arange(count))
 
 
 def build_features(codes: np.ndarray) -> Features:
@@ -28,7 +28,7 @@ def build_features(codes: np.ndarray) -> Features:
 
 
 def draw_centres(count: int, seed: int = 0) -> np.ndarray:
-    """Words as the centres of large clusters are: hardly a zero, and one greatest component."""
+    """Draw words like the centres of large clusters: few zeros, and one greatest component."""
     rng = np.random.default_rng(seed)
     means = rng.gamma(2.0, 1.0, (count, 128)) + 0.1
     return np.rint(means / np.linalg.norm(means, axis=1, keepdims=True) * 512).clip(1, 255).astype(np.uint8)
@@ -41,7 +41,7 @@ def save_database(folder: Path, words: np.ndarray) -> Asset:
 
 
 def lift_features(secret: Features, folder: Path, words: np.ndarray, seed: int = 0, **settings: Any) -> Subspaces:
-    """The secret's release by affine lifting through these words."""
+    """Release the secret by affine lifting through these words."""
     defense = Affine(database=save_database(folder, words), **settings)
     return defense.protect(secret, Public(), np.random.default_rng(seed))
 
@@ -51,11 +51,11 @@ def create_view(release: Subspaces) -> View:
 
 
 def change_bases(release: Subspaces, rng: np.random.Generator) -> Subspaces:
-    """The same subspaces by another point and another basis."""
-    turn = np.linalg.qr(rng.normal(size=(len(release), release.dim, release.dim))).Q
+    """Describe the subspaces by another point and another basis."""
+    rotation = np.linalg.qr(rng.normal(size=(len(release), release.dim, release.dim))).Q
     away = rng.normal(size=(len(release), 1, release.dim)) @ release.bases
     origins = (release.origins + away[:, 0]).astype(np.float32)
-    bases = (turn @ release.bases).astype(np.float32)
+    bases = (rotation @ release.bases).astype(np.float32)
     return Subspaces(positions=Points(keypoints=release.keypoints), size=release.size, origins=origins, bases=bases)
 
 

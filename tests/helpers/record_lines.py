@@ -1,4 +1,4 @@
-"""One record with few fields, for tests of tables."""
+"""A record with few fields, for tests of tables."""
 
 from typing import Any
 
@@ -7,7 +7,7 @@ from bench.runner.records import SCHEMA, seal
 SIFT = {"name": "sift", "upright": True}
 
 
-def record(unit: str = "a", **more: Any) -> dict[str, Any]:
+def record(sample: str = "a", **more: Any) -> dict[str, Any]:
     return seal(
         {
             "schema": SCHEMA,
@@ -18,7 +18,7 @@ def record(unit: str = "a", **more: Any) -> dict[str, Any]:
             "attack": {"name": "dia", "weights": "sha256:ab"},
             "dataset": {"name": "photos", "hash": "sha256:0", "extractor": SIFT},
             "seed": 0,
-            "sample": unit,
+            "sample": sample,
             "status": "ok",
             "reason": None,
             "metrics": {"mae": 0.1, "psnr": 20.0, "ssim": 0.5, "angle": None, "keypoints": 100},

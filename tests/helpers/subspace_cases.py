@@ -1,4 +1,4 @@
-"""Made-up subspaces, and how far a point is from a span."""
+"""Synthetic subspaces, and the distance of a point from a span."""
 
 import numpy as np
 from scipy.linalg import lstsq
@@ -10,7 +10,7 @@ D = 128
 
 
 def draw_subspaces(rng: np.random.Generator, count: int, dim: int) -> Subspaces:
-    """Each through a descriptor, about as lifting makes them."""
+    """Draw subspaces that contain a descriptor, similar to those of lifting."""
     points = draw_features(count, seed=int(rng.integers(1000))).descriptors.astype(np.float64)
     bases = np.linalg.qr(rng.normal(size=(count, D, dim)))[0].transpose(0, 2, 1)
     origins = points + (rng.normal(size=(count, 1, dim)) @ bases)[:, 0]
@@ -21,6 +21,6 @@ def draw_subspaces(rng: np.random.Generator, count: int, dim: int) -> Subspaces:
 
 
 def residual(columns: np.ndarray, target: np.ndarray) -> float:
-    """How far the target is from the span of the columns."""
+    """Distance of the target from the span of the columns."""
     solution = lstsq(columns.astype(np.float64), target.astype(np.float64))[0]
     return float(np.linalg.norm(columns @ solution - target))

@@ -1,4 +1,4 @@
-"""Photographs: one rule for all, and each kind of bad file with its own message."""
+"""The rule for photographs, and the error of each kind of invalid file."""
 
 from pathlib import Path
 
@@ -17,7 +17,7 @@ def save(path: Path, image: Image.Image, **options: object) -> Path:
     return path
 
 
-def test_built_in_photographs_are_there() -> None:
+def test_built_in_photographs() -> None:
     sources = photographs.list_builtin()
     assert [source.name for source in sources] == [
         "astronaut",
@@ -49,7 +49,7 @@ def test_empty_and_missing_folders(tmp_path: Path) -> None:
         photographs.list_photographs(tmp_path / "absent")
 
 
-def test_square_is_cut_from_the_centre(tmp_path: Path) -> None:
+def test_square_is_cropped_from_the_centre(tmp_path: Path) -> None:
     pixels = np.zeros((100, 300, 3), np.uint8)
     pixels[:, 100:200] = 200  # the centred square
     read = photographs.read(save(tmp_path / "wide.png", Image.fromarray(pixels))).pixels
@@ -64,7 +64,7 @@ def test_truncated_jpeg(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [b"", b"text", b"\x89PNG\r\n\x1a\n", b"RIFF\x00\x00\x00\x00WEBP"])
-def test_file_that_is_no_image(tmp_path: Path, content: bytes) -> None:
+def test_file_that_is_not_an_image(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "false.png"
     path.write_bytes(content)
     with pytest.raises(SampleError, match=r"false\.png: cannot be read as an image"):
@@ -105,7 +105,7 @@ def test_exif_rotation_is_applied(tmp_path: Path) -> None:
     assert read[:, :50].max() < 50
 
 
-def test_transparency_is_laid_over_white(tmp_path: Path) -> None:
+def test_transparency_is_composited_over_white(tmp_path: Path) -> None:
     clear = Image.new("RGBA", (64, 64), (255, 0, 0, 0))
     palette = Image.new("P", (64, 64), 3)
     palette.putpalette([0, 0, 255] * 256)
@@ -124,7 +124,7 @@ def test_palette_without_transparency(tmp_path: Path) -> None:
     assert (found.pixels == (10, 20, 30)).all()
 
 
-def test_part_is_held_out_for_validation(tmp_path: Path) -> None:
+def test_validation_set(tmp_path: Path) -> None:
     sources = photographs.list_photographs(write_album(tmp_path / "all", 4))
     names = tmp_path / "names.txt"
     names.write_text("1.png\n3.png\n")

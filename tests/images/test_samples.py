@@ -1,4 +1,4 @@
-"""Units and what is kept of them: queries of a place, their features, and the words of its references."""
+"""Samples of a scene, cached features, and the dictionary of its references."""
 
 import dataclasses
 from pathlib import Path
@@ -16,7 +16,7 @@ from bench.images import samples
 from bench.images.scene import Pixels, Scene
 from bench.localization.scene_index import SceneIndex
 from bench.tasks.collisions import Collisions
-from bench.testing import same
+from bench.testing import are_equal
 
 TINY = Gallery(views=2, queries=3, width=64, height=48, detail=0.1)
 
@@ -26,7 +26,7 @@ def _cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(store.VARIABLE, str(tmp_path / "cache"))
 
 
-def test_queries_are_units_with_their_condition_and_the_whole_scene_counts() -> None:
+def test_queries_become_samples_and_the_whole_scene_is_hashed() -> None:
     collection = samples.collect_queries(TINY)
     assert [unit.condition for unit in collection.samples] == ["day", "day", "night"]
     assert len({unit.content_hash() for unit in collection.samples}) == 3
@@ -34,13 +34,13 @@ def test_queries_are_units_with_their_condition_and_the_whole_scene_counts() -> 
     assert collection.extra_inputs != other.extra_inputs
 
 
-def test_a_task_of_photographs_refuses_a_place() -> None:
-    with pytest.raises(UserError, match="takes no dataset"):
+def test_task_of_photographs_takes_no_dataset() -> None:
+    with pytest.raises(UserError, match="takes photographs, not a dataset"):
         Collisions().collect(None, TINY)
 
 
 class Counted(Pixels):
-    """A texture that counts how often it is read."""
+    """A texture that counts its reads."""
 
     def __init__(self, seed: int) -> None:
         self.seed, self.reads = seed, 0
@@ -53,23 +53,23 @@ class Counted(Pixels):
         return np.array(draw_texture(self.seed))
 
 
-def test_features_are_kept_by_content_and_made_again_when_damaged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_features_are_cached_by_content_and_computed_again_if_damaged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     image, extractor = Counted(1), Sift()
     first = feature_cache.extract(extractor, image)
-    assert same(first, extractor.extract(np.array(draw_texture(1))))
-    assert same(first, feature_cache.extract(extractor, image))
+    assert are_equal(first, extractor.extract(np.array(draw_texture(1))))
+    assert are_equal(first, feature_cache.extract(extractor, image))
     assert image.reads == 1
     assert len(feature_cache.extract(Sift(max_keypoints=3), image)) <= 3  # another extractor
-    assert not same(first, feature_cache.extract(extractor, Counted(2)))  # another image
+    assert not are_equal(first, feature_cache.extract(extractor, Counted(2)))  # another image
     assert image.reads == 2
     for file in (tmp_path / "cache").rglob("*.safetensors"):
         file.write_bytes(file.read_bytes()[:-9])
-    assert same(first, feature_cache.extract(extractor, image))
+    assert are_equal(first, feature_cache.extract(extractor, image))
     assert image.reads == 3
-    assert "made again" in caplog.text
+    assert "computed again" in caplog.text
 
 
-def test_words_of_the_references_are_clustered_to_the_number_asked_for(tmp_path: Path) -> None:
+def test_dictionary_of_the_references_has_the_given_size(tmp_path: Path) -> None:
     index = SceneIndex(write_scene(tmp_path / "scene"), Sift())
     public = Public(scene_index=index)
     few, more = public.dictionary("references", 20), public.dictionary("references", 40)
@@ -84,21 +84,21 @@ def test_words_of_the_references_are_clustered_to_the_number_asked_for(tmp_path:
         Public().dictionary("references")
 
 
-def test_more_words_than_the_limit_on_keypoints_gives_are_made_of_all_keypoints(tmp_path: Path) -> None:
+def test_large_dictionary_is_built_without_the_limit_on_keypoints(tmp_path: Path) -> None:
     index = SceneIndex(write_scene(tmp_path / "scene"), Sift(max_keypoints=5))
     assert sum(map(len, index.reference_features)) == 15
     assert len(index.build_dictionary(15)) == 15
     assert len(index.build_dictionary(40)) == 40
 
 
-def test_a_place_keeps_no_query_for_attackers_to_find(tmp_path: Path) -> None:
+def test_scene_index_holds_no_query(tmp_path: Path) -> None:
     whole = write_scene(tmp_path / "scene")
     assert whole.queries
     assert SceneIndex(whole, Sift()).scene.queries == ()
     assert SceneIndex(whole, Sift()).scene.references == whole.references
 
 
-def test_a_scene_without_queries_is_a_mistake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_scene_without_queries_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bare: Scene = dataclasses.replace(write_scene(tmp_path / "scene"), queries=())
     monkeypatch.setattr(Gallery, "scene", lambda self: bare)
     with pytest.raises(UserError, match="has no queries"):

@@ -29,6 +29,7 @@ def batch(rng: np.random.Generator, count: int = BATCH) -> tuple[EncodedRelease,
     return points, torch.from_numpy(rng.random((count, 3, 256, 256)).astype(np.float32))
 
 
+@pytest.mark.slow
 def test_the_average_follows_its_formula(rng):
     """After the first steps the average follows its formula."""
     learner = Learner(Inverter(Shape(inputs=130, widths=(8, 8))), Training(steps=3, batch=1, warmup=1))
@@ -43,6 +44,7 @@ def test_the_average_follows_its_formula(rng):
     assert not torch.equal(learner.load_average().state_dict()[name], last)
 
 
+@pytest.mark.slow
 def test_the_rate_rises_and_then_falls_to_zero(rng):
     learner = Learner(Inverter(Shape(inputs=130, widths=(8, 8))), Training(steps=9, batch=1, warmup=2, rate=1e-3))
     rates = []

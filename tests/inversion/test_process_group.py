@@ -13,6 +13,7 @@ from bench.cli import main
 from bench.extractors.sift import Sift
 from bench.images import photographs
 from bench.inversion import learner, norm, reconstruct, weights
+from bench.inversion.network import Shape
 from bench.inversion.plan import PROFILES, Plan, Training
 from bench.inversion.process_group import ProcessGroup, launch
 from defenses.none import Undefended
@@ -38,6 +39,7 @@ def run_half(rank, folder, jointly):
     distributed.destroy_process_group()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("jointly", [True, False])
 def test_batch_norm_is_over_the_batch_of_both_processes(jointly, tmp_path):
     """PyTorch's own, over each process's part, differs (negative control)."""
@@ -66,7 +68,8 @@ def read_losses(folder):
 
 
 def train_in_single_precision(*given):
-    """Train and reconstruct without rounding to half precision, which grows from step to step."""
+    """Train and reconstruct a small network without rounding to half precision, which grows from step to step."""
+    Shape.__init__.__kwdefaults__.update(SMALL)
     learner.pick_dtype = reconstruct.pick_dtype = lambda device: torch.float32
     return inversion.train_worker(*given)
 
@@ -74,6 +77,8 @@ def train_in_single_precision(*given):
 def restore_after_test(monkeypatch):
     for module in (learner, reconstruct):
         monkeypatch.setattr(module, "pick_dtype", module.pick_dtype)
+    for name in SMALL:
+        monkeypatch.setitem(Shape.__init__.__kwdefaults__, name, getattr(Shape, name))
 
 
 def train_without_joint_norms(*given):
@@ -90,12 +95,13 @@ def build_arguments(folder, name):
         photographs=sources[:2],
         validation=sources[2:3],
         extractor=Sift(),
-        widths=(16, 16, 16),
+        widths=(8, 8),
         training=SHORT,
     )
     return plan, folder / name, folder / f"log-{name}"
 
 
+SMALL = {"hidden": 32, "painted": 4}
 # First steps are signs of gradients, or orthogonal, so rounding changes the smallest parts; at a low rate this has little effect.
 SHORT = Training(steps=4, batch=4, warmup=2, rate=1e-4)
 PROCESSES = {
@@ -105,6 +111,7 @@ PROCESSES = {
 }
 
 
+@pytest.mark.exhaustive
 def test_two_processes_train_as_one_with_the_whole_batch(tmp_path, monkeypatch):
     """The same loss at every step, the same scores. Not so if each process normalises its own part (control)."""
     restore_after_test(monkeypatch)
@@ -121,6 +128,7 @@ def test_two_processes_train_as_one_with_the_whole_batch(tmp_path, monkeypatch):
     assert not list(tmp_path.glob("*.checkpoint"))
 
 
+@pytest.mark.exhaustive
 def test_two_processes_resume_the_training_of_one(tmp_path, monkeypatch):
     restore_after_test(monkeypatch)
     monkeypatch.setattr(inversion, "CHECKPOINT_EVERY", 1)
@@ -140,6 +148,7 @@ def test_two_processes_resume_the_training_of_one(tmp_path, monkeypatch):
     np.testing.assert_allclose(read_losses(tmp_path / "log-parts"), read_losses(tmp_path / "log-whole"), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_user_error_in_a_process_is_reported_in_one_line(tmp_path, capsys):
     folder = tmp_path / "photos"
     folder.mkdir()

@@ -149,6 +149,7 @@ def test_position_symmetries_keep_descriptors():
         assert np.array_equal(moved.descriptors, release.descriptors)
 
 
+@pytest.mark.slow
 def test_crops_are_drawn_under_every_symmetry(rng):
     """Descriptors of a crop equal those extracted from its pixels; in another order they do not (control)."""
 
@@ -170,6 +171,7 @@ def test_crops_are_drawn_under_every_symmetry(rng):
     assert measure_cosines(confused).min() < 0.7
 
 
+@pytest.mark.slow
 def test_averaging_over_symmetries_improves_the_shipped_network():
     """Mean SSIM over three photographs; with a wrong order of the components it is worse (control)."""
     module = weights.load(ASSETS / "inversion-none.safetensors").module

@@ -181,6 +181,7 @@ def test_same_order_uses_only_pairs_that_differ_enough() -> None:
 # ---- the tables
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(tables.load_tables()))
 def test_the_papers_values_satisfy_its_claims(name: str) -> None:
     """With the paper's values for each photograph every claim holds; with negated values no claim with a direction does."""
@@ -247,6 +248,7 @@ def test_table_4_defenses_release_the_true_word_with_the_papers_probability() ->
         assert privacy.epsilon == pytest.approx(epsilon - math.log(2))
 
 
+@pytest.mark.slow
 def test_table_3_has_the_specified_trials() -> None:
     """Profile paper: the paper's 10M, 1M, 100k and 10k. Profile cpu: as many as two cores can run."""
     settings = {name: dataclasses.replace(SETTING, profile=profile) for name, profile in PROFILES.items()}
@@ -260,6 +262,7 @@ def test_table_3_has_the_specified_trials() -> None:
     assert trials["cpu"]["voc-match"] == 30_000
 
 
+@pytest.mark.slow
 def test_table_3_shares_the_row_of_its_point_with_table_2() -> None:
     point = next(row for row in table2.build_rows(SETTING) if row.name == "|K| 256k, ε 10, m 2")
     own = {row.name: row for row in table3.build_rows(SETTING)}

@@ -1,4 +1,4 @@
-"""Tables of boards, as Markdown, CSV and LaTeX."""
+"""Tables of comparison groups, as Markdown, CSV and LaTeX."""
 
 import csv
 import io
@@ -9,9 +9,11 @@ import fabricated
 import pytest
 from fabricated import DIA, inapplicable, ldp, localizations, reconstructions
 
-from leaderboard import comparison, group_tables
+from bench.core import table as core_table
+from bench.core.table import to_csv, to_latex, to_markdown
+from leaderboard import comparison
 from leaderboard.comparison import ComparisonGroup
-from leaderboard.group_tables import Sheet
+from leaderboard.group_tables import GroupTable, build_pairs_table, build_ranking_table
 from leaderboard.intervals import interval
 
 NONE = {"name": "none"}
@@ -20,44 +22,45 @@ HOSTILE = "<script>alert(1)</script> | *b* [x](javascript:y) $\\input{z}$ & 50% 
 
 
 @pytest.fixture
-def board(tmp_path: Path) -> ComparisonGroup:
+def group(tmp_path: Path) -> ComparisonGroup:
     records = [
         *reconstructions(NONE, [0.7, 0.9]),
         *reconstructions(ldp(8.0), [0.3, 0.4]),
         *reconstructions(ldp(8.0), [0.1, 0.2], attack=NEAREST),
         inapplicable(NONE, NEAREST, "nearest attacks Subspaces; none releases Descriptors"),
     ]
-    (found,) = comparison.build_groups(comparison.load_records(fabricated.write(tmp_path, records)))
-    return found
+    (group,) = comparison.build_groups(comparison.load_records(fabricated.write(tmp_path, records)))
+    return group
 
 
 def cells(line: str, bar: str) -> list[str]:
     return [cell.strip() for cell in re.split(bar, line)]
 
 
-def test_numbers_stand_with_their_bootstrap_intervals(board: ComparisonGroup) -> None:
-    row = group_tables.ranking(board).rows[0]
+def test_numbers_have_bootstrap_intervals(group: ComparisonGroup) -> None:
+    row = build_ranking_table(group).rows[0]
     assert row.values["ssim"] == interval([0.3, 0.4])
     assert row.values["epsilon_descriptor"] == 8.0
     assert row.values["epsilon_image"] == pytest.approx(8.0 * 100.5 * 0.9)  # the smaller composition, the median photograph
     assert row.values["guarantee"] == "ε-LDP"
-    assert "| **0.35 [0.3, 0.4]** |" in group_tables.to_markdown(group_tables.ranking(board))
+    assert "| **0.35 [0.3, 0.4]** |" in to_markdown(build_ranking_table(group))
 
 
-def test_the_best_is_bold_among_the_strongest_attacks_alone(board: ComparisonGroup) -> None:
+def test_the_best_is_bold_among_the_strongest_attacks_alone(group: ComparisonGroup) -> None:
     """A weak attack on a defense makes no column's best: it says little of the defense."""
-    every = group_tables.pairs(board)
-    (ssim,) = (column for column in every.columns if column.name == "ssim")
-    bold = [(row.values["defense"], row.values["attack"]) for row in every.rows if every.is_best(ssim, row)]
+    table = build_pairs_table(group)
+    (ssim,) = (column for column in table.columns if column.name == "ssim")
+    index = table.columns.index(ssim)
+    bold = [(row.values["defense"], row.values["attack"]) for row in table.rows if index in row.best]
     assert bold == [("ldp:epsilon=8,subset_size=2", "dia")]
-    assert r"\textbf{0.35 {[}0.3, 0.4{]}}" in group_tables.to_latex(every)
+    assert r"\textbf{0.35 {[}0.3, 0.4{]}}" in to_latex(table)
 
 
-def test_what_does_not_apply_is_told_why(board: ComparisonGroup) -> None:
-    every = group_tables.pairs(board)
-    (row,) = (row for row in every.rows if row.cell.reason)
+def test_what_does_not_apply_has_its_reason(group: ComparisonGroup) -> None:
+    table = build_pairs_table(group)
+    (row,) = (row for row in table.rows if row.experiment.reason)
     assert row.values["ssim"] is None
-    written = group_tables.to_markdown(every)
+    written = to_markdown(table)
     (line,) = (line for line in written.splitlines() if line.startswith("|") and "nearest" in line and "none" in line)
     mark = re.search(r"none \[(\d)\]", line)
     assert mark
@@ -65,38 +68,37 @@ def test_what_does_not_apply_is_told_why(board: ComparisonGroup) -> None:
     assert f"[{mark[1]}] nearest attacks Subspaces; none releases Descriptors" in written
 
 
-def test_csv_has_full_precision_and_the_ends_of_intervals(board: ComparisonGroup) -> None:
-    first, *_ = csv.DictReader(io.StringIO(group_tables.to_csv(group_tables.ranking(board))))
+def test_csv_has_full_precision_and_the_ends_of_intervals(group: ComparisonGroup) -> None:
+    first, *_ = csv.DictReader(io.StringIO(to_csv(build_ranking_table(group))))
     expected = interval([0.3, 0.4])
     assert [float(first[name]) for name in ("ssim", "ssim_low", "ssim_high")] == [expected.mean, expected.low, expected.high]
     assert first["rank"] == "1"
-    (inapplicable,) = (
-        row for row in csv.DictReader(io.StringIO(group_tables.to_csv(group_tables.pairs(board)))) if row["units"] == "n/a"
-    )
+    (inapplicable,) = (row for row in csv.DictReader(io.StringIO(to_csv(build_pairs_table(group)))) if row["units"] == "n/a")
     assert [inapplicable[name] for name in ("ssim", "ssim_low", "ssim_high")] == ["n/a"] * 3
     assert "nearest attacks" in inapplicable["note"]
 
 
 def test_a_single_photograph_has_no_interval(tmp_path: Path) -> None:
-    (found,) = comparison.build_groups(comparison.load_records(fabricated.write(tmp_path, reconstructions(NONE, [0.5]))))
-    assert "| 0.5 |" in group_tables.to_markdown(group_tables.ranking(found))
-    (row,) = csv.DictReader(io.StringIO(group_tables.to_csv(group_tables.ranking(found))))
+    (group,) = comparison.build_groups(comparison.load_records(fabricated.write(tmp_path, reconstructions(NONE, [0.5]))))
+    assert "| 0.5 |" in to_markdown(build_ranking_table(group))
+    (row,) = csv.DictReader(io.StringIO(to_csv(build_ranking_table(group))))
     assert (row["ssim"], row["ssim_low"]) == ("0.5", "n/a")
 
 
-def test_what_only_some_photographs_have_tells_how_many(tmp_path: Path) -> None:
-    """Such as the share of faces that are found again, where few photographs show one."""
+def test_a_metric_of_some_photographs_shows_their_number(tmp_path: Path) -> None:
+    """Such as the fraction of faces that are found again, where few photographs show one."""
     records = reconstructions(NONE, [0.5, 0.6, 0.7])
     for record, face in zip(records, (None, 1.0, 0.0), strict=True):
         record["metrics"]["face"] = face
-    (found,) = comparison.build_groups(comparison.load_records(fabricated.write(tmp_path, records)))
-    (row,) = group_tables.pairs(found).rows
-    (column,) = (column for column in group_tables.pairs(found).columns if column.name == "face")
-    assert group_tables.shown(column, row) == "0.5 [0, 1] (n = 2)"
+    (group,) = comparison.build_groups(comparison.load_records(fabricated.write(tmp_path, records)))
+    table = build_pairs_table(group)
+    (row,) = table.rows
+    (column,) = (column for column in table.columns if column.name == "face")
+    assert row.texts[table.columns.index(column)] == "0.5 [0, 1] (n = 2)"
 
 
-def test_latex_is_booktabs_of_even_rows(board: ComparisonGroup) -> None:
-    written = group_tables.to_latex(group_tables.pairs(board))
+def test_latex_is_booktabs_of_even_rows(group: ComparisonGroup) -> None:
+    written = to_latex(build_pairs_table(group))
     assert all(rule in written for rule in (r"\toprule", r"\midrule", r"\bottomrule"))
     layout = re.search(r"\\begin\{tabular\}\{(\w+)\}", written)
     assert layout
@@ -110,47 +112,44 @@ def test_strings_of_users_are_text_in_every_format(tmp_path: Path) -> None:
     hostile = {"name": HOSTILE, "field": HOSTILE}
     dataset = fabricated.PHOTOGRAPHS | {"name": HOSTILE}
     records = reconstructions(hostile, [0.5, 0.6], dataset=dataset, attack=DIA | {"name": HOSTILE})
-    (found,) = comparison.build_groups(comparison.load_records(fabricated.write(tmp_path, records)))
-    sheet = group_tables.pairs(found)
-    check_rows(sheet)
-    (row,) = csv.DictReader(io.StringIO(group_tables.to_csv(sheet)))
+    (group,) = comparison.build_groups(comparison.load_records(fabricated.write(tmp_path, records)))
+    table = build_pairs_table(group)
+    check_rows(table)
+    (row,) = csv.DictReader(io.StringIO(to_csv(table)))
     assert row["attack"].startswith(HOSTILE)
-    body = group_tables.to_latex(sheet).split(r"\midrule")[1]
+    body = to_latex(table).split(r"\midrule")[1]
     for special in "&#$%_":
         allowed = {"&": r"(?<!\\)&", "$": r"(?<!\\)\$(?!\\varepsilon|\\delta)"}.get(special, rf"(?<!\\){re.escape(special)}")
         line = body.splitlines()[1]
         count = len(re.findall(allowed, line))
-        assert count == (len(sheet.columns) - 1 if special == "&" else 0), (special, line)
+        assert count == (len(table.columns) - 1 if special == "&" else 0), (special, line)
     assert r"\input" not in body
     assert r"\textbackslash{}input\{z\}" in body
 
 
-def check_rows(sheet: Sheet) -> None:
+def check_rows(table: GroupTable) -> None:
     """Markdown keeps one line a row, with as many cells as there are columns, and starts no markup."""
-    written = group_tables.to_markdown(sheet)
+    written = to_markdown(table)
     rows = [line for line in written.splitlines() if line.startswith("|")]
-    assert len(rows) == 2 + len(sheet.rows)
-    assert {len(cells(line, r"(?<!\\)\|")) for line in rows} == {len(sheet.columns) + 2}
+    assert len(rows) == 2 + len(table.rows)
+    assert {len(cells(line, r"(?<!\\)\|")) for line in rows} == {len(table.columns) + 2}
     assert not re.search(r"(?<!\\)[<`]", written)
     assert not re.search(r"(?<!\\)\]\(javascript", written)
 
 
 def test_a_broken_escape_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(group_tables, "markdown", lambda text: text)
+    monkeypatch.setattr(core_table, "escape_markdown", lambda text: text)
     with pytest.raises(AssertionError):
         test_strings_of_users_are_text_in_every_format(tmp_path)
 
 
-def test_tables_of_a_server_are_led_by_what_it_is_judged_by(tmp_path: Path) -> None:
+def test_utility_tables_begin_with_the_judged_measures(tmp_path: Path) -> None:
     records = [*localizations(NONE, [1, 1], ["day"] * 2), *localizations(ldp(8.0), [1, 0], ["day"] * 2)]
-    (found,) = comparison.build_groups(comparison.load_records(fabricated.write(tmp_path, records)))
-    sheet = group_tables.pairs(found)
-    names = [column.name for column in sheet.columns]
+    (group,) = comparison.build_groups(comparison.load_records(fabricated.write(tmp_path, records)))
+    table = build_pairs_table(group)
+    names = [column.name for column in table.columns]
     assert "rank" not in names
     assert "attack" not in names
     assert names.index("recall_0.25m_2deg_day") < names.index("translation_error_day") < names.index("inliers")
-    assert [row.values["defense"] for row in sheet.rows] == ["none", "ldp:epsilon=8,subset_size=2"]
-    assert [sheet.is_best(next(c for c in sheet.columns if c.name == "recall_0.25m_2deg_day"), row) for row in sheet.rows] == [
-        True,
-        False,
-    ]
+    assert [row.values["defense"] for row in table.rows] == ["none", "ldp:epsilon=8,subset_size=2"]
+    assert [names.index("recall_0.25m_2deg_day") in row.best for row in table.rows] == [True, False]

@@ -1,4 +1,4 @@
-"""The command that makes a cell again: read by the command line, it is the same cell."""
+"""The command that repeats an experiment: the command line reads it as the same experiment."""
 
 import shlex
 from pathlib import Path
@@ -17,7 +17,6 @@ from bench.core.hashing import short_hash
 from bench.datasets.gallery import Gallery
 from bench.extractors.sift import Sift
 from bench.registry import discovery, spec
-from bench.runner import execute
 from bench.runner.plan import Plan, RunConfiguration, build_plan
 from bench.tasks.collisions import Collisions
 from bench.tasks.localization import Localization
@@ -34,7 +33,7 @@ def planned(command: str) -> Plan:
     assert not extra
     task = spec.read(args.task, discovery.TASK)
     attacks: list[Attack] = [spec.read(text, discovery.ATTACK) for text in args.attack or []]
-    defenses: list[Defense] = [run._defense(text, task) for text in args.defense]
+    defenses: list[Defense] = [run._read_defense(text, task) for text in args.defense]
     pairs = tuple((defense, attack) for defense in defenses for attack in attacks or [None])
     extractor: Extractor = spec.read(args.extractor, discovery.EXTRACTOR)
     dataset = None if args.dataset is None else spec.read(args.dataset, discovery.DATASET)
@@ -43,9 +42,9 @@ def planned(command: str) -> Plan:
     )
 
 
-def written(plan: Plan) -> list[GroupedExperiment]:
-    heads = [cell.metadata | {"sample": "a", "status": "ok", "reason": None} for cell in plan.experiments]
-    return [GroupedExperiment(defense="d", attack="a", records=(LocatedRecord(head, Path()),)) for head in heads]
+def group(plan: Plan) -> list[GroupedExperiment]:
+    records = [experiment.metadata | {"sample": "a", "status": "ok", "reason": None} for experiment in plan.experiments]
+    return [GroupedExperiment(defense="d", attack="a", records=(LocatedRecord(record, Path()),)) for record in records]
 
 
 UPRIGHT, ORIENTED = Sift(), Sift(upright=False, max_keypoints=77)
@@ -63,23 +62,23 @@ UPRIGHT, ORIENTED = Sift(), Sift(upright=False, max_keypoints=77)
         ("ldp", "repeat:releases=4", ORIENTED),
     ],
 )
-def test_the_command_is_the_cell(
+def test_the_command_repeats_the_experiment(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, defense: str, attack: str, extractor: Extractor
 ) -> None:
     write_album(tmp_path / "my album")
     monkeypatch.chdir(tmp_path)
     pairs = ((spec.read(defense, discovery.DEFENSE), spec.read(attack, discovery.ATTACK)),)
-    asked = RunConfiguration(
+    configuration = RunConfiguration(
         pairs=pairs, images=Path("my album"), task=Reconstruction(), extractor=extractor, dataset=None, seed=7
     )
-    plan = build_plan(asked)
-    (cell,) = written(plan)
-    command = build_recipe(cell).command
-    assert planned(command).hash == plan.hash == short_hash([cell.metadata["experiment_id"]])
+    plan = build_plan(configuration)
+    (experiment,) = group(plan)
+    command = build_recipe(experiment).command
+    assert planned(command).hash == plan.hash == short_hash([experiment.metadata["experiment_id"]])
 
 
-def test_what_is_as_by_default_is_not_spelt_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = RunConfiguration(
+def test_default_fields_are_omitted(monkeypatch: pytest.MonkeyPatch) -> None:
+    configuration = RunConfiguration(
         pairs=((spec.read("affine", discovery.DEFENSE), None),),
         images=None,
         task=Collisions(),
@@ -87,27 +86,28 @@ def test_what_is_as_by_default_is_not_spelt_out(monkeypatch: pytest.MonkeyPatch)
         dataset=None,
         seed=0,
     )
-    (cell,) = written(build_plan(asked))
-    assert build_recipe(cell).command == "bench run --task collisions --defense affine --seed 0"
-    assert build_recipe(cell).needs == ()
+    (experiment,) = group(build_plan(configuration))
+    assert build_recipe(experiment).command == "bench run --task collisions --defense affine --seed 0"
+    assert build_recipe(experiment).needs == ()
 
 
-def test_words_of_a_place_are_made_there_again() -> None:
+@pytest.mark.slow
+def test_a_dictionary_of_the_scene_is_built_again() -> None:
     tiny = Gallery(width=64, height=48, detail=0.1, views=2, queries=2)
     ldp = spec.read("ldp:epsilon=9,words=32,dictionary=references", discovery.DEFENSE)
     task = Localization(retrieval="released", trials=100)
     plan = build_plan(RunConfiguration(pairs=((ldp, None),), images=None, task=task, extractor=Sift(), dataset=tiny, seed=1))
-    (cell,) = written(plan)
-    found = build_recipe(cell)
-    assert found.command == (
+    (experiment,) = group(plan)
+    repeated = build_recipe(experiment)
+    assert repeated.command == (
         "bench run --task localization:retrieval=released,trials=100 --defense ldp:epsilon=9,words=32 "
         "--dataset gallery:views=2,queries=2,width=64,height=48,detail=0.1 --seed 1"
     )
-    assert planned(found.command).hash == plan.hash
-    assert any("is made from the references of the place" in line for line in found.needs)
+    assert planned(repeated.command).hash == plan.hash
+    assert any("is made from the references of the scene" in line for line in repeated.needs)
 
 
-def test_files_of_ones_own_are_named_by_their_digest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_own_files_are_named_by_their_digest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     own = write_dictionary(tmp_path)
     write_album(tmp_path / "album")
     monkeypatch.chdir(tmp_path)
@@ -115,33 +115,33 @@ def test_files_of_ones_own_are_named_by_their_digest(tmp_path: Path, monkeypatch
     plan = build_plan(
         RunConfiguration(pairs=pairs, images=Path("album"), task=Reconstruction(), extractor=Sift(), dataset=None, seed=0)
     )
-    (cell,) = written(plan)
-    found = build_recipe(cell)
-    assert found.command == "bench run --defense ldp:epsilon=5,dictionary=FILE --attack keypoints --images album --seed 0"
-    digest = cell.metadata["defense"]["dictionary"]
-    assert f"FILE for dictionary of ldp: {digest}" in found.needs
-    assert planned(found.command.replace("FILE", own)).hash == plan.hash
+    (experiment,) = group(plan)
+    repeated = build_recipe(experiment)
+    assert repeated.command == "bench run --defense ldp:epsilon=5,dictionary=FILE --attack keypoints --images album --seed 0"
+    digest = experiment.metadata["defense"]["dictionary"]
+    assert f"FILE for dictionary of ldp: {digest}" in repeated.needs
+    assert planned(repeated.command.replace("FILE", own)).hash == plan.hash
 
 
-def of(records: list[dict[str, Any]]) -> GroupedExperiment:
+def fabricate(records: list[dict[str, Any]]) -> GroupedExperiment:
     return GroupedExperiment(defense="d", attack="a", records=tuple(LocatedRecord(one, Path()) for one in records))
 
 
-def test_a_plugin_that_is_not_here_has_all_its_fields() -> None:
+def test_a_plugin_that_is_not_installed_has_all_its_fields() -> None:
     stranger = {"name": "stranger", "levels": 8, "soft": True, "rate": 0.5, "file": None}
-    (command,) = build_recipe(of(reconstructions(stranger, [0.5], attack={"name": "unheard-of"}))).command.splitlines()
+    (command,) = build_recipe(fabricate(reconstructions(stranger, [0.5], attack={"name": "unheard-of"}))).command.splitlines()
     assert "--defense stranger:levels=8,soft=true,rate=0.5,file=none --attack unheard-of" in command
 
 
 def test_each_seed_has_its_line() -> None:
     records = reconstructions(ldp(8.0), [0.5], seed=3) + reconstructions(ldp(8.0), [0.5], seed=1)
-    assert [line.rpartition(" ")[2] for line in build_recipe(of(records)).command.splitlines()] == ["1", "3"]
+    assert [line.rpartition(" ")[2] for line in build_recipe(fabricate(records)).command.splitlines()] == ["1", "3"]
 
 
 @pytest.mark.parametrize("name", ["$(touch pwned)", "a b; rm -rf x", "--out=elsewhere", "it's\n`id`"])
-def test_a_shell_takes_names_for_names(name: str) -> None:
-    cell = of(reconstructions({"name": name}, [0.5], dataset=PHOTOGRAPHS | {"name": name}))
-    program, run, *words = shlex.split(build_recipe(cell).command)
+def test_names_are_quoted_for_a_shell(name: str) -> None:
+    experiment = fabricate(reconstructions({"name": name}, [0.5], dataset=PHOTOGRAPHS | {"name": name}))
+    program, run, *words = shlex.split(build_recipe(experiment).command)
     assert (program, run) == ("bench", "run")
     args, extra = cli.build_parser().parse_known_args([run, *words])
     assert not extra
@@ -150,18 +150,18 @@ def test_a_shell_takes_names_for_names(name: str) -> None:
     assert args.out is None
 
 
-def test_the_settings_of_a_task_are_told() -> None:
+def test_the_settings_of_a_task_are_given() -> None:
     settings = {
         "task": "localization",
         "task_settings": {"retrieval": "released", "retrieved": 20, "trials": 500},
         "attack": None,
     }
-    command = build_recipe(of(reconstructions({"name": "none"}, [0.5], **settings))).command
+    command = build_recipe(fabricate(reconstructions({"name": "none"}, [0.5], **settings))).command
     assert command.startswith("bench run --task localization:retrieval=released,trials=500 --defense none --images photos")
 
 
-def test_the_place_of_a_dataset_is_told_by_its_spec() -> None:
+def test_a_dataset_is_given_by_its_spec() -> None:
     gallery = fabricated.GALLERY | {"spec": {"name": "gallery", "views": 12, "queries": 300}}
-    cell = of(reconstructions({"name": "none"}, [0.5], dataset=gallery))
-    assert "--dataset gallery:views=12" in build_recipe(cell).command
-    assert "--images" not in build_recipe(cell).command
+    experiment = fabricate(reconstructions({"name": "none"}, [0.5], dataset=gallery))
+    assert "--dataset gallery:views=12" in build_recipe(experiment).command
+    assert "--images" not in build_recipe(experiment).command

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from fake_plugins.guess import Guess
-from fakes import FAKES, write_album, install_plugins
+from fakes import FAKES, install_plugins, write_album
 from scipy import stats
 
 import bench
@@ -17,6 +17,7 @@ from bench import cli
 from bench.api import View
 from bench.codebook.examples import write_dictionary
 from bench.geometry.nearest_words import unit_rows
+from bench.runner.records import seal
 from bench.tasks.reconstruction import Reconstruction
 from bench.types import Features, WordSets
 from defenses.ldp import LDP
@@ -25,50 +26,55 @@ from leaderboard.regression import RegressionResult, compare, compute_tolerance
 
 Records = list[dict[str, Any]]
 SEEDS = range(2)
-PAINTED = Reconstruction(inverter="painter")
+RECONSTRUCTION = Reconstruction(inverter="sketch")
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """With photographs in it, and the fake plugins installed for as long as it is used."""
-    made = tmp_path_factory.mktemp("regression")
-    write_album(made / "album", 3)
+    folder = tmp_path_factory.mktemp("regression")
+    write_album(folder / "album", 3)
     with pytest.MonkeyPatch.context() as monkeypatch:
-        install_plugins(made / "installed", monkeypatch, FAKES)
-        yield made
+        install_plugins(folder / "installed", monkeypatch, FAKES)
+        yield folder
 
 
 @pytest.fixture(scope="module")
 def before(folder: Path) -> Records:
-    return measured(folder, SEEDS)
+    return measure(folder, SEEDS)
 
 
-def measured(folder: Path, seeds: range, epsilon: float = 8.0) -> Records:
+def measure(folder: Path, seeds: range, epsilon: float = 8.0) -> Records:
     """The first word of each set as a guess, at an ε where about every second set holds the true one."""
     defense = LDP(epsilon=epsilon, dictionary=write_dictionary(folder))
-    return [record for seed in seeds for record in bench.run([defense], [Guess()], folder / "album", task=PAINTED, seed=seed)]
+    return [
+        record for seed in seeds for record in bench.run([defense], [Guess()], folder / "album", task=RECONSTRUCTION, seed=seed)
+    ]
 
 
-def verdicts(found: list[RegressionResult]) -> dict[str, str]:
-    return {finding.metric: finding.verdict for finding in found}
+def verdicts(results: list[RegressionResult]) -> dict[str, str]:
+    return {result.metric: result.verdict for result in results}
 
 
 # ---- what must pass, and what must fail
 
 
+@pytest.mark.slow
 def test_the_same_again_is_the_same(folder: Path, before: Records) -> None:
-    found = compare(before, copy.deepcopy(before))
-    assert {finding.verdict for finding in found} == {"same"}
-    assert {"angle", "l2", "recovered"} <= set(verdicts(found))
+    results = compare(before, copy.deepcopy(before))
+    assert {result.verdict for result in results} == {"same"}
+    assert {"angle", "l2", "recovered"} <= set(verdicts(results))
 
 
+@pytest.mark.slow
 def test_other_seeds_are_within_the_tolerance(folder: Path, before: Records) -> None:
     """And differ, so that something was tolerated."""
-    found = compare(before, measured(folder, range(2, 4)))
-    assert {finding.verdict for finding in found} == {"same"}
-    assert any(finding.before != finding.after for finding in found)
+    results = compare(before, measure(folder, range(2, 4)))
+    assert {result.verdict for result in results} == {"same"}
+    assert any(result.before != result.after for result in results)
 
 
+@pytest.mark.slow
 def test_a_weakened_attack_fails(folder: Path, before: Records, monkeypatch: pytest.MonkeyPatch) -> None:
 
     def blunt(self: Guess, view: View, rng: np.random.Generator) -> np.ndarray:
@@ -76,13 +82,14 @@ def test_a_weakened_attack_fails(folder: Path, before: Records, monkeypatch: pyt
         return unit_rows(rng.normal(size=view.release.candidates[:, 0].shape).astype(np.float32))
 
     monkeypatch.setattr(Guess, "recover", blunt)
-    found = verdicts(compare(before, measured(folder, SEEDS)))
-    assert found["recovered"] == found["angle"] == "weaker"
-    assert "better" not in found.values()
+    results = verdicts(compare(before, measure(folder, SEEDS)))
+    assert results["recovered"] == results["angle"] == "weaker"
+    assert "better" not in results.values()
 
 
+@pytest.mark.slow
 def test_a_broken_defense_fails(folder: Path, before: Records, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One that always tells the true word first."""
+    """One that always releases the true word first."""
     protect = LDP.protect
 
     def telling(self: LDP, secret: Features, public: Any, rng: np.random.Generator) -> WordSets:
@@ -91,10 +98,11 @@ def test_a_broken_defense_fails(folder: Path, before: Records, monkeypatch: pyte
         return release
 
     monkeypatch.setattr(LDP, "protect", telling)
-    found = verdicts(compare(before, measured(folder, SEEDS)))
-    assert found["recovered"] == found["angle"] == "worse"
+    results = verdicts(compare(before, measure(folder, SEEDS)))
+    assert results["recovered"] == results["angle"] == "worse"
 
 
+@pytest.mark.slow
 def test_a_defense_whose_source_is_another_may_get_better(folder: Path, before: Records, monkeypatch: pytest.MonkeyPatch) -> None:
     protect = LDP.protect
 
@@ -104,7 +112,7 @@ def test_a_defense_whose_source_is_another_may_get_better(folder: Path, before: 
         return release
 
     monkeypatch.setattr(LDP, "protect", silent)
-    after = measured(folder, SEEDS)
+    after = measure(folder, SEEDS)
     assert verdicts(compare(before, after))["recovered"] == "weaker"
     for record in after:
         record["sources"]["defense"] = "sha256:another"
@@ -122,32 +130,40 @@ def test_a_weaker_promise_is_worse_without_tolerance(folder: Path, before: Recor
     assert verdicts(compare(before, after))["epsilon_descriptor"] == "worse"
 
 
-def test_lost_units_failures_and_cells(folder: Path, before: Records) -> None:
+@pytest.mark.slow
+def test_lost_samples_failures_and_experiments(folder: Path, before: Records) -> None:
     broken = [
         record | {"status": "failed", "reason": "out of paper"} if record["sample"] == "1.png" else record for record in before
     ]
-    (lost,) = [finding for finding in compare(before, broken) if finding.verdict == "missing"]
-    assert lost.note == "1 of 3 units: 1.png: out of paper"
-    other = measured(folder, range(1), epsilon=9.0)
-    assert [finding.verdict for finding in compare(before, other)] == ["missing", "new"]
+    (lost,) = [result for result in compare(before, broken) if result.verdict == "missing"]
+    assert lost.note == "1 of 3 samples: 1.png: out of paper"
+    other = measure(folder, range(1), epsilon=9.0)
+    assert [result.verdict for result in compare(before, other)] == ["missing", "new"]
 
 
-def test_another_metric_makes_no_other_cell_and_other_settings_cannot_be_compared(before: Records) -> None:
+def test_a_new_metric_keeps_the_experiment_and_other_settings_cannot_be_compared(before: Records) -> None:
     after = copy.deepcopy(before)
     for record in after:
         record["metric_settings"] |= {"more": {}, "ssim": {"sigma": 2.0}}
-    found = verdicts(compare(before, after))
-    assert found["ssim"] == "missing"
-    assert found["recovered"] == "same"
+    results = verdicts(compare(before, after))
+    assert results["ssim"] == "missing"
+    assert results["recovered"] == "same"
 
 
 def test_utility_has_its_own_direction() -> None:
     """Recall of localization, which no attack takes part in."""
 
     def judged(recall: float) -> Records:
-        head = {"experiment_id": "0", "schema": 1, "task": "localization", "defense": {"name": "none"}, "attack": None, "dataset": {}}
+        head = {
+            "experiment_id": "0",
+            "schema": 1,
+            "task": "localization",
+            "defense": {"name": "none"},
+            "attack": None,
+            "dataset": {},
+        }
         head |= {"status": "ok", "privacy": {"guarantee": "none", "epsilon_descriptor": None}}
-        return [head | {"sample": str(unit), "metrics": {"recall_0.25m_2deg": recall}} for unit in range(5)]
+        return [head | {"sample": str(sample), "metrics": {"recall_0.25m_2deg": recall}} for sample in range(5)]
 
     assert verdicts(compare(judged(0.9), judged(0.5))) == {"recall_0.25m_2deg": "worse"}
     assert verdicts(compare(judged(0.5), judged(0.9))) == {"recall_0.25m_2deg": "better"}
@@ -156,34 +172,35 @@ def test_utility_has_its_own_direction() -> None:
 # ---- tolerances, against an independent reference
 
 
-def drawn(rng: np.random.Generator, units: int, seeds: int, spread: float) -> dict[str, list[float]]:
-    heights = np.linspace(0, 50, units)
-    return {str(unit): (heights[unit] + rng.normal(0, spread, seeds)).tolist() for unit in range(units)}
+def draw_values(rng: np.random.Generator, samples: int, seeds: int, spread: float) -> dict[str, list[float]]:
+    heights = np.linspace(0, 50, samples)
+    return {str(sample): (heights[sample] + rng.normal(0, spread, seeds)).tolist() for sample in range(samples)}
 
 
-def test_tolerance_of_one_unit_is_that_of_students_test(rng: np.random.Generator) -> None:
-    before, after = drawn(rng, 1, 5, 2.0), drawn(rng, 1, 4, 2.0)
+def test_tolerance_of_one_sample_is_that_of_students_test(rng: np.random.Generator) -> None:
+    before, after = draw_values(rng, 1, 5, 2.0), draw_values(rng, 1, 4, 2.0)
     reference = stats.ttest_ind(after["0"], before["0"]).confidence_interval(0.999)
     assert compute_tolerance(before, after, 0.0) == pytest.approx((reference.high - reference.low) / 2)
 
 
+@pytest.mark.slow
 def test_false_alarms_are_rare_and_shifts_are_found(rng: np.random.Generator) -> None:
-    """Units differ by far more than seeds do, which must not matter."""
+    """Samples differ by far more than seeds do, which must not matter."""
 
     def apart(shift: float) -> bool:
-        before, after = drawn(rng, 7, 3, 1.0), drawn(rng, 7, 3, 1.0)
-        gap = np.mean([np.mean(after[unit]) + shift - np.mean(before[unit]) for unit in before])
+        before, after = draw_values(rng, 7, 3, 1.0), draw_values(rng, 7, 3, 1.0)
+        gap = np.mean([np.mean(after[sample]) + shift - np.mean(before[sample]) for sample in before])
         return bool(abs(gap) > compute_tolerance(before, after, 0.0))
 
     assert sum(apart(0.0) for _ in range(2000)) <= 10  # two are expected
     assert sum(apart(3.0) for _ in range(200)) >= 198
 
 
-def test_one_seed_takes_the_spread_over_units_and_one_unit_the_floor() -> None:
-    before = {str(unit): [0.0] for unit in range(7)}
-    steady = {str(unit): [0.1 + unit / 1000] for unit in range(7)}
-    mixed = {str(unit): [0.3 * (-1) ** unit] for unit in range(7)}
-    assert compute_tolerance(before, steady, 0.01) == 0.01  # all units moved alike
+def test_one_seed_takes_the_spread_over_samples_and_one_sample_the_minimum() -> None:
+    before = {str(sample): [0.0] for sample in range(7)}
+    steady = {str(sample): [0.1 + sample / 1000] for sample in range(7)}
+    mixed = {str(sample): [0.3 * (-1) ** sample] for sample in range(7)}
+    assert compute_tolerance(before, steady, 0.01) == 0.01  # all samples moved alike
     assert compute_tolerance(before, mixed, 0.01) > 0.2
     assert compute_tolerance({"0": [0.0]}, {"0": [5.0]}, 0.01) == 0.01
 
@@ -193,14 +210,14 @@ def test_one_seed_takes_the_spread_over_units_and_one_unit_the_floor() -> None:
 
 @pytest.fixture
 def folders(before: Records, tmp_path: Path) -> tuple[Path, Path]:
-    worse = [record | {"metrics": record["metrics"] | {"recovered": 1.0}} for record in before]
+    worse = [seal(record | {"metrics": record["metrics"] | {"recovered": 1.0}}) for record in before]
     for name, held in (("before", before), ("after", worse)):
         (tmp_path / name).mkdir()
         (tmp_path / name / "records.jsonl").write_text("".join(json.dumps(record) + "\n" for record in held))
     return tmp_path / "before" / "records.jsonl", tmp_path / "after"
 
 
-def test_command_tells_and_exits_with_3(folders: tuple[Path, Path], capfd: pytest.CaptureFixture[str]) -> None:
+def test_command_shows_the_verdict_and_exits_with_3(folders: tuple[Path, Path], capfd: pytest.CaptureFixture[str]) -> None:
     baseline, results = map(str, folders)
     assert cli.main(["check", "--baseline", baseline, "--results", baseline]) == 0
     shown = capfd.readouterr().out

@@ -26,9 +26,10 @@ from bench.tasks.reconstruction import Reconstruction
 from leaderboard.reproduce import command, figures, page, run, tables
 from leaderboard.reproduce.claims import Claim, Verdict, falling, same_order
 from leaderboard.reproduce.profiles import CPU, SMOKE, Materials, Setting
-from leaderboard.reproduce.run import RunResult, TestSet
+from leaderboard.reproduce.run import EvaluationSet, RunResult
 from leaderboard.reproduce.study import Measure, Row, Table, build_plugin
 
+LONG = ("table1", "table2", "table4", "figures")  # tens of seconds each
 TABLES = sorted(tables.load_tables())
 
 
@@ -71,7 +72,11 @@ def read_lines(out: Path) -> list[bytes]:
 # ---- from end to end
 
 
-@pytest.mark.parametrize("name", TABLES)
+def mark_long(names: list[str]) -> list[Any]:
+    return [pytest.param(name, marks=pytest.mark.exhaustive if name in LONG else pytest.mark.slow) for name in names]
+
+
+@pytest.mark.parametrize("name", mark_long(TABLES))
 def test_smoke(name: str, images: Path, out: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert reproduce(name, images, out) == 0
     output = capsys.readouterr().out
@@ -96,6 +101,7 @@ def test_smoke(name: str, images: Path, out: Path, capsys: pytest.CaptureFixture
     assert len(statements) == sum(len(claim["statements"]) for claim in report["claims"])
 
 
+@pytest.mark.exhaustive
 def test_repeated_reproduction_runs_nothing_and_changes_nothing(images: Path, out: Path) -> None:
     """Table 4 reuses Table 1's records for its reference rows."""
     for name in ("table1", "table4"):
@@ -120,6 +126,7 @@ def find_unsupported_rows(setting: Setting) -> dict[str, str | None]:
     return {name: reason for name, reason in reasons.items() if reason is not None}
 
 
+@pytest.mark.slow
 def test_shipped_files_support_every_row() -> None:
     setting = Setting(profile=CPU, materials=Materials(), extractor=Sift(), photographs=7)
     assert find_unsupported_rows(setting) == {}
@@ -127,7 +134,7 @@ def test_shipped_files_support_every_row() -> None:
     assert len(find_unsupported_rows(replace(setting, materials=another))) == 16
 
 
-@pytest.mark.parametrize("name", ["figures", "figure-inlier"])
+@pytest.mark.parametrize("name", mark_long(["figures", "figure-inlier"]))
 def test_figures(name: str, images: Path, out: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert reproduce(name, images, out) == 0
     output = capsys.readouterr().out
@@ -142,6 +149,7 @@ def test_figures(name: str, images: Path, out: Path, capsys: pytest.CaptureFixtu
                 assert np.asarray(Image.open(file).convert("L")).std() > 5  # something is drawn
 
 
+@pytest.mark.slow
 def test_interrupted_reproduction_resumes_with_the_same_result(
     images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -232,7 +240,7 @@ def reproduce_table(ssim: dict[str, list[float | None]]) -> run.ReproducedTable:
         for name, values in ssim.items()
     }
     result = RunResult(rows=build_rows(setting), experiment_ids={name: (name,) for name in ssim}, records=records)
-    return run.compare_with_paper(TABLE, setting, TestSet(name="photographs", names=("0",) * 8, available=8), result)
+    return run.compare_with_paper(TABLE, setting, EvaluationSet(name="photographs", names=("0",) * 8, available=8), result)
 
 
 def build_values(mean: float, count: int = 8) -> list[float | None]:
@@ -286,7 +294,7 @@ def test_median_counts_a_sample_without_a_value_as_the_worst() -> None:
     }
     row = build_rows(setting)[0]
     result = RunResult(rows=(row,), experiment_ids={row.name: tuple(records)}, records=records)
-    table = run.compare_with_paper(definition, setting, TestSet(name="scene", names=("a",), available=1), result)
+    table = run.compare_with_paper(definition, setting, EvaluationSet(name="scene", names=("a",), available=1), result)
     assert table.ours["raw", "mean"].mean == 1.5
     assert table.ours["raw", "mean"].count == 2
     assert table.ours["raw", "median"].mean == float("inf")

@@ -9,10 +9,9 @@ import fabricated
 import pytest
 from fabricated import DIA, ENVIRONMENT, PHOTOGRAPHS, SETTINGS, draw_picture, inapplicable, ldp, localizations, reconstructions
 
-from bench.runner.directory import reconstruction_path
+from bench.runner.directory import photograph_path, reconstruction_path
 from bench.runner.records import experiment_id
 from leaderboard import site
-from leaderboard.run_report import photograph_path
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 
@@ -80,7 +79,7 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture
 def page(browser: Any, index: Path) -> Iterator[Any]:
-    """The page as it opens. At the end nothing has been complained of, and nothing was asked of any network."""
+    """The page as it opens. At the end there are no console messages and no network requests."""
     yield from opened(browser, index, {"width": 1200, "height": 900})
 
 
@@ -93,26 +92,26 @@ def opened(browser: Any, index: Path, size: dict[str, int]) -> Iterator[Any]:
     context = browser.new_context(viewport=size)
     page = context.new_page()
     page.set_default_timeout(10_000)
-    said, asked = [], []
-    page.on("console", lambda message: said.append(message.text))
-    page.on("pageerror", lambda error: said.append(str(error)))
-    page.on("request", lambda request: asked.append(request.url))
+    messages, requests = [], []
+    page.on("console", lambda message: messages.append(message.text))
+    page.on("pageerror", lambda error: messages.append(str(error)))
+    page.on("request", lambda request: requests.append(request.url))
     page.goto(index.as_uri())
     yield page
     context.close()
-    assert said == []
-    assert [url for url in asked if not url.startswith(index.parent.as_uri())] == []
-    assert asked
+    assert messages == []
+    assert [url for url in requests if not url.startswith(index.parent.as_uri())] == []
+    assert requests
 
 
 def listed(page: Any, column: str = "defense") -> list[str]:
-    """What stands in a column of the rows that are shown, from top to bottom."""
-    cells = page.locator(f'.board:visible tbody tr:visible [data-column="{column}"]')
-    return [cell.get_attribute("data-value") for cell in cells.all()]
+    """Return the values of a column in the visible rows, from top to bottom."""
+    values = page.locator(f'.group:visible tbody tr:visible [data-column="{column}"]')
+    return [value.get_attribute("data-value") for value in values.all()]
 
 
-def head(page: Any, label: str) -> Any:
-    return page.locator(".board:visible thead").get_by_role("button", name=label, exact=True)
+def column_button(page: Any, label: str) -> Any:
+    return page.locator(".group:visible thead").get_by_role("button", name=label, exact=True)
 
 
 def dialog(page: Any) -> Any:
@@ -120,18 +119,19 @@ def dialog(page: Any) -> Any:
 
 
 def shows(page: Any, title: str) -> None:
-    """The cell of that title is open, or will be in a moment."""
+    """Wait until the experiment of that title is open."""
     playwright.expect(dialog(page).locator("h2")).to_have_text(title)
 
 
 def closed(page: Any) -> None:
-    """No cell is open, or will be in a moment."""
+    """Wait until no experiment is open."""
     playwright.expect(dialog(page)).to_have_count(0)
 
 
 LDP4, LDP16 = "ldp:epsilon=4,subset_size=2", "ldp:epsilon=16,subset_size=2"
 
 
+@pytest.mark.exhaustive
 def test_it_opens_ranked_with_the_strongest_attack_on_each(page: Any) -> None:
     defenses = listed(page)
     assert defenses[:4] == [LDP4, LDP16, "affine:dim=4", "none"]
@@ -142,22 +142,24 @@ def test_it_opens_ranked_with_the_strongest_attack_on_each(page: Any) -> None:
     assert page.locator("tr:visible .note", has_text="unranked: no adapted attacker").count() == 1
 
 
+@pytest.mark.exhaustive
 def test_sorting_by_a_column_both_ways_with_what_is_missing_last(page: Any) -> None:
-    head(page, "ε/descriptor").click()
+    column_button(page, "ε/descriptor").click()
     assert listed(page, "epsilon_descriptor") == ["4.0", "16.0", "", "", "", ""]
-    assert page.locator('.board:visible th[aria-sort="ascending"]').inner_text().strip().startswith("ε/descriptor")
-    head(page, "ε/descriptor").click()
+    assert page.locator('.group:visible th[aria-sort="ascending"]').inner_text().strip().startswith("ε/descriptor")
+    column_button(page, "ε/descriptor").click()
     assert listed(page, "epsilon_descriptor") == ["16.0", "4.0", "", "", "", ""]
-    head(page, "SSIM").click()
+    column_button(page, "SSIM").click()
     scores = [float(value) for value in listed(page, "ssim")]
     assert scores == sorted(scores)
-    assert listed(page)[0] == "new"  # an unranked one is first only when it is asked for
-    head(page, "rank").click()
+    assert listed(page)[0] == "new"  # an unranked one is first only on request
+    column_button(page, "rank").click()
     assert listed(page)[0] == LDP4
 
 
+@pytest.mark.exhaustive
 def test_sorting_by_keyboard(page: Any) -> None:
-    head(page, "MAE").focus()
+    column_button(page, "MAE").focus()
     page.keyboard.press("Enter")
     ascending = [float(value) for value in listed(page, "mae")]
     assert ascending == sorted(ascending)
@@ -165,14 +167,15 @@ def test_sorting_by_keyboard(page: Any) -> None:
     assert [float(value) for value in listed(page, "mae")] == ascending[::-1]
 
 
+@pytest.mark.exhaustive
 def test_filtering_by_words_and_showing_all_attacks(page: Any) -> None:
-    box = page.locator(".board:visible .filter")
+    box = page.locator(".group:visible .filter")
     box.fill("LDP epsilon=16")
     assert listed(page) == [LDP16]
-    assert page.locator(".board:visible .count").inner_text() == "1 of 9 rows"
+    assert page.locator(".group:visible .count").inner_text() == "1 of 9 rows"
     box.fill("nearest affine")
     assert listed(page, "attack") == ["nearest"]
-    page.locator(".board:visible .only").uncheck()
+    page.locator(".group:visible .only").uncheck()
     box.fill("affine")
     assert listed(page, "attack") == ["nearest", "dia"]
     box.fill("no such thing")
@@ -181,7 +184,8 @@ def test_filtering_by_words_and_showing_all_attacks(page: Any) -> None:
     assert len(listed(page)) == 9
 
 
-def test_a_row_opens_its_cell_by_click_and_the_way_back_closes_it(page: Any) -> None:
+@pytest.mark.exhaustive
+def test_a_row_opens_its_experiment_by_click_and_the_way_back_closes_it(page: Any) -> None:
     page.locator("tr:visible .open", has_text="ldp").first.click()
     shown = dialog(page)
     shows(page, "ldp against dia")
@@ -197,8 +201,9 @@ def test_a_row_opens_its_cell_by_click_and_the_way_back_closes_it(page: Any) -> 
     closed(page)
 
 
-def test_a_row_opens_its_cell_by_keyboard(page: Any) -> None:
-    page.locator(".board:visible .only").focus()
+@pytest.mark.exhaustive
+def test_a_row_opens_its_experiment_by_keyboard(page: Any) -> None:
+    page.locator(".group:visible .only").focus()
     for _ in range(40):
         page.keyboard.press("Tab")
         if page.evaluate("document.activeElement.className") == "open":
@@ -207,11 +212,12 @@ def test_a_row_opens_its_cell_by_keyboard(page: Any) -> None:
     shows(page, "ldp against dia")
     page.keyboard.press("Escape")
     closed(page)
-    page.wait_for_function("document.activeElement.className === 'open'")  # the reader is where he was
+    page.wait_for_function("document.activeElement.className === 'open'")  # the focus is back on the link
 
 
-def test_a_point_of_the_plot_opens_its_cell(page: Any) -> None:
-    chart = page.locator(".board:visible .chart").first
+@pytest.mark.exhaustive
+def test_a_point_of_the_plot_opens_its_experiment(page: Any) -> None:
+    chart = page.locator(".group:visible .chart").first
     points = chart.locator(".point")
     assert points.count() == 5
     assert chart.locator("path.front").first.get_attribute("d").startswith("M")
@@ -228,15 +234,16 @@ def test_a_point_of_the_plot_opens_its_cell(page: Any) -> None:
     assert "Localization on gallery" in dialog(page).inner_text()
 
 
+@pytest.mark.exhaustive
 def test_the_slider_uncovers_the_photograph(page: Any) -> None:
     page.locator("tr:visible .open").first.click()
     stage, slider = dialog(page).locator(".stage"), dialog(page).locator(".stage input")
-    for name in ("original", "made"):
+    for name in ("original", "reconstruction"):
         loaded = f"document.querySelector('dialog[open] .{name}').naturalWidth"
         page.wait_for_function(f"{loaded} === 256")
 
     def covered() -> str:
-        return str(page.evaluate("getComputedStyle(document.querySelector('dialog[open] .made')).clipPath"))
+        return str(page.evaluate("getComputedStyle(document.querySelector('dialog[open] .reconstruction')).clipPath"))
 
     assert covered() == "inset(0px 0px 0px 50%)"
     slider.focus()
@@ -249,26 +256,28 @@ def test_the_slider_uncovers_the_photograph(page: Any) -> None:
     page.mouse.down()
     page.mouse.move(box["x"] + box["width"] * 0.75, box["y"] + box["height"] / 2)
     page.mouse.up()
-    share = float(covered().rpartition(" ")[2].removesuffix("%)"))
-    assert share == pytest.approx(75, abs=4)
-    assert slider.get_attribute("aria-valuetext") == f"{share:g} % photograph"
+    fraction = float(covered().rpartition(" ")[2].removesuffix("%)"))
+    assert fraction == pytest.approx(75, abs=4)
+    assert slider.get_attribute("aria-valuetext") == f"{fraction:g} % photograph"
 
 
-def test_another_photograph_can_be_chosen_and_a_lost_one_is_told(page: Any) -> None:
+@pytest.mark.exhaustive
+def test_another_photograph_can_be_chosen_and_a_missing_one_is_noted(page: Any) -> None:
     page.locator("tr:visible .open").first.click()
-    made = dialog(page).locator(".made")
-    first = made.get_attribute("src")
+    reconstruction = dialog(page).locator(".reconstruction")
+    first = reconstruction.get_attribute("src")
     assert dialog(page).locator("output").inner_text() == "0.png · SSIM 0.2"
     dialog(page).get_by_role("button", name="1.png").click()
-    assert made.get_attribute("src") != first
-    assert made.get_attribute("alt") == "What the attack makes of 1.png"
+    assert reconstruction.get_attribute("src") != first
+    assert reconstruction.get_attribute("alt") == "The reconstruction of 1.png"
     dialog(page).get_by_role("button", name="2.png").click()
     assert "the photograph is not beside these records" in dialog(page).locator("output").inner_text()
     assert dialog(page).locator(".stage input").is_disabled()
     assert not dialog(page).locator(".original").is_visible()
 
 
-def test_a_cell_has_an_address(browser: Any, index: Path) -> None:
+@pytest.mark.exhaustive
+def test_an_experiment_has_an_address(browser: Any, index: Path) -> None:
     for page in opened(browser, index, {"width": 1200, "height": 900}):
         address = page.locator("tr:visible .open").nth(3).get_attribute("href")
         page.goto("about:blank")
@@ -276,19 +285,21 @@ def test_a_cell_has_an_address(browser: Any, index: Path) -> None:
         shows(page, "none against dia")
 
 
+@pytest.mark.exhaustive
 def test_other_results_are_chosen_from_a_list(page: Any) -> None:
     page.get_by_label("Results").select_option(index=2)
-    assert page.locator(".board:visible h2").inner_text() == "Localization on gallery"
+    assert page.locator(".group:visible h2").inner_text() == "Localization on gallery"
     assert listed(page) == ["none", LDP16, "affine:dim=4", LDP4, "new"]  # the most useful first
-    assert page.locator(".board:visible .chart").count() == 0
+    assert page.locator(".group:visible .chart").count() == 0
 
 
+@pytest.mark.exhaustive
 def test_on_a_phone_nothing_runs_over_the_side(phone: Any) -> None:
     def fits() -> bool:
         return bool(phone.evaluate("document.documentElement.scrollWidth <= document.documentElement.clientWidth"))
 
     assert fits()
-    phone.locator(".board:visible .only").uncheck()
+    phone.locator(".group:visible .only").uncheck()
     assert fits()
     phone.get_by_label("Sort by").locator("visible=true").select_option("ssim")
     scores = [float(value) for value in listed(phone, "ssim") if value]
@@ -302,8 +313,9 @@ def test_on_a_phone_nothing_runs_over_the_side(phone: Any) -> None:
     assert fits()
 
 
+@pytest.mark.exhaustive
 def test_strings_of_users_are_text(page: Any) -> None:
-    page.locator(".board:visible .only").uncheck()
+    page.locator(".group:visible .only").uncheck()
     page.locator(".open", has_text="window.owned").locator("visible=true").first.click()
     dialog(page).locator("summary").click()
     text = dialog(page).inner_text()
@@ -317,6 +329,7 @@ def test_strings_of_users_are_text(page: Any) -> None:
     assert page.locator("img[onerror]").count() == 0
 
 
+@pytest.mark.exhaustive
 def test_even_a_script_that_got_in_would_not_run(browser: Any, index: Path, tmp_path: Path) -> None:
     """The negative control of the escaping: unescaped markup does run a script without the policy, and not with it."""
     text = index.read_text(encoding="utf-8")
@@ -333,6 +346,7 @@ def test_even_a_script_that_got_in_would_not_run(browser: Any, index: Path, tmp_
     assert owned == {"with": None, "without": 1}
 
 
+@pytest.mark.slow
 def test_names_of_records_lead_to_no_other_files(tmp_path: Path) -> None:
     """Somebody's records are shown with the pictures that lie beside them, and with no others."""
     secret = draw_picture(tmp_path / "secret.png", 1)
@@ -346,6 +360,7 @@ def test_names_of_records_lead_to_no_other_files(tmp_path: Path) -> None:
     assert record["experiment_id"] == experiment_id({"name": "reconstruction"}, NONE, DIA, PHOTOGRAPHS, 0, SETTINGS)
 
 
+@pytest.mark.slow
 def test_it_is_written_alike_again(tmp_path: Path) -> None:
     records = reconstructions(NONE, [0.8, 0.7]) + reconstructions(ldp(4.0), [0.2, 0.3])
     folder = fabricated.write(tmp_path / "runs", records)

@@ -1,4 +1,4 @@
-"""Checking somebody's records: each lie is told with its line, and what is honest passes."""
+"""The check of submitted records: each false value is reported with its line, and honest records pass."""
 
 import copy
 import dataclasses
@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from fake_plugins.guess import Guess
 from fake_plugins.peeker import Peeker
-from fakes import write_album, install_plugins, write_scene
+from fakes import install_plugins, write_album, write_scene
 
 import bench
 from bench import cli
@@ -33,56 +33,59 @@ from leaderboard import submission
 from leaderboard.submission import Fault
 
 Lines = list[dict[str, Any]]
-PLUGINS = {"feature_privacy.attacks": {name: f"fake_plugins.{name}:PLUGIN" for name in ("painter", "guess", "peeker")}}
+PLUGINS = {"feature_privacy.attacks": {name: f"fake_plugins.{name}:PLUGIN" for name in ("sketch", "guess", "peeker")}}
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Photographs, a dictionary, and the fake plugins installed."""
-    made = tmp_path_factory.mktemp("submission")
-    write_album(made / "album", 2)
+    path = tmp_path_factory.mktemp("submission")
+    write_album(path / "album", 2)
     with pytest.MonkeyPatch.context() as monkeypatch:
-        install_plugins(made / "installed", monkeypatch, PLUGINS)
-        yield made
+        install_plugins(path / "installed", monkeypatch, PLUGINS)
+        yield path
 
 
 @pytest.fixture(scope="module")
-def honest(place: Path) -> Lines:
+def honest(folder: Path) -> Lines:
     """Two records of a pair that applies, and one of a pair that does not."""
-    return sorted(run(place, Guess(), Undefended()), key=lambda record: record["status"], reverse=True)
+    return sorted(run(folder, Guess(), Undefended()), key=lambda record: record["status"], reverse=True)
 
 
-def run(place: Path, attack: Any, *more: Any) -> Lines:
-    ldp = LDP(epsilon=8.0, dictionary=write_dictionary(place))
-    return bench.run([ldp, *more], [attack], place / "album", task=Reconstruction(inverter="painter"))
+def run(folder: Path, attack: Any, *more: Any) -> Lines:
+    ldp = LDP(epsilon=8.0, dictionary=write_dictionary(folder))
+    return bench.run([ldp, *more], [attack], folder / "album", task=Reconstruction(inverter="sketch"))
 
 
 @pytest.fixture
-def faults(place: Path, tmp_path: Path) -> Callable[..., list[Fault]]:
+def faults(folder: Path, tmp_path: Path) -> Callable[..., list[Fault]]:
     def check(lines: Lines | str, sample: int = 0) -> list[Fault]:
         path = tmp_path / "records.jsonl"
         path.write_text(lines if isinstance(lines, str) else "".join(json.dumps(records.seal(line)) + "\n" for line in lines))
-        (dictionary,) = place.glob("dictionary-*.safetensors")
-        return submission.check(path, images=place / "album", files=[dictionary], sample=sample)[1]
+        (dictionary,) = folder.glob("dictionary-*.safetensors")
+        return submission.check(path, images=folder / "album", files=[dictionary], sample=sample)[1]
 
     return check
 
 
-def test_honest_records_pass_and_come_out_again(faults: Callable[..., list[Fault]], honest: Lines) -> None:
+@pytest.mark.slow
+def test_honest_records_pass_and_are_reproduced(faults: Callable[..., list[Fault]], honest: Lines) -> None:
     assert [record["status"] for record in honest] == ["ok", "ok", "n/a"]
     assert faults(honest, sample=1) == []
 
 
-def test_what_looks_at_the_secret_is_found(faults: Callable[..., list[Fault]], place: Path) -> None:
-    """Every number of its records is what `bench run` measured; only the other process tells."""
-    cheating = run(place, Peeker())
+@pytest.mark.slow
+def test_an_attack_that_reads_the_secret_is_found(faults: Callable[..., list[Fault]], folder: Path) -> None:
+    """All numbers of its records are those of `bench run`; only a separate process shows the difference."""
+    cheating = run(folder, Peeker())
     assert all(record["metrics"]["recovered"] == 1 for record in cheating)
     assert faults(cheating) == []
-    found = faults(cheating, sample=2)
-    assert {fault.line for fault in found} == {1, 2}
-    assert any(fault.message.startswith("metrics.recovered: is 1, and 0.") for fault in found)
+    reported = faults(cheating, sample=2)
+    assert {fault.line for fault in reported} == {1, 2}
+    assert any(fault.message.startswith("metrics.recovered: is 1, and 0.") for fault in reported)
 
 
+@pytest.mark.slow
 def test_another_number_is_found(faults: Callable[..., list[Fault]], honest: Lines) -> None:
     lied = copy.deepcopy(honest[:2])
     lied[1]["metrics"]["recovered"] *= 0.5
@@ -99,8 +102,8 @@ def change(*path: str, to: Any) -> Callable[[dict[str, Any]], None]:
     return changed
 
 
-def hashed_again(record: dict[str, Any]) -> None:
-    """As someone who lies with care would."""
+def update_hashes(record: dict[str, Any]) -> None:
+    """Hash the changed record again."""
     task = {"name": record["task"], **record["task_settings"]}
     parts = (task, record["defense"], record["attack"], record["dataset"], record["seed"], record["metric_settings"])
     record["experiment_id"] = records.experiment_id(*parts)
@@ -118,7 +121,7 @@ def hashed_again(record: dict[str, Any]) -> None:
         (change("privacy", "private", to=True), "privacy.private: False was expected"),
         (change("status", to="good"), "status: 'good' is not one of"),
         (change("reason", to="why"), "reason: 'why' is not of type 'null'"),
-        (change("defense", "epsilon", to=9.0), "cell_id: is "),
+        (change("defense", "epsilon", to=9.0), "experiment_id: is "),
         (change("environment", "threads", to=99), "run_hash: is "),
         (change("metrics", "ssim", to=1.5), "metrics.ssim: 1.5 is not from -1 to 1"),
         (change("metrics", "keypoints", to=3), "privacy.keypoints: not the keypoints"),
@@ -127,11 +130,11 @@ def hashed_again(record: dict[str, Any]) -> None:
         (change("sample", to="7.png"), "sample: the dataset has no '7.png'"),
     ],
 )
-def test_lies_about_one_record(faults: Callable[..., list[Fault]], honest: Lines, lie: Any, complaint: str) -> None:
+def test_false_values_of_one_record(faults: Callable[..., list[Fault]], honest: Lines, lie: Any, complaint: str) -> None:
     lied = copy.deepcopy(honest)
     lie(lied[1])
-    told = [fault.message for fault in faults(lied) if fault.line == 2]
-    assert any(what.startswith(complaint) for what in told), told
+    messages = [fault.message for fault in faults(lied) if fault.line == 2]
+    assert any(message.startswith(complaint) for message in messages), messages
 
 
 @pytest.mark.parametrize(
@@ -144,13 +147,13 @@ def test_lies_about_one_record(faults: Callable[..., list[Fault]], honest: Lines
         (change("metric_settings", "ssim", to={}), "metric_settings.ssim is {}"),
     ],
 )
-def test_lies_about_a_cell_that_are_hashed_again(
+def test_false_values_of_an_experiment_with_new_hashes(
     faults: Callable[..., list[Fault]], honest: Lines, lie: Any, complaint: str
 ) -> None:
     lied = copy.deepcopy(honest[:2])
     for record in lied:
         lie(record)
-        hashed_again(record)
+        update_hashes(record)
     (fault,) = faults(lied)
     assert fault.line == 1
     assert complaint in fault.message
@@ -163,9 +166,10 @@ def test_pairs_that_do_not_apply_and_pairs_that_do(faults: Callable[..., list[Fa
     assert any("does not apply (guess attacks" in fault.message for fault in faults([bold]))
 
 
-def test_left_out_and_repeated(faults: Callable[..., list[Fault]], honest: Lines) -> None:
-    assert faults(honest[:1]) == [Fault(1, "its cell lacks 1 of 2 units, such as '1.png'")]
-    assert faults([*honest[:2], honest[0]]) == [Fault(3, "the same unit of the same cell as line 1")]
+@pytest.mark.slow
+def test_missing_and_repeated_samples(faults: Callable[..., list[Fault]], honest: Lines) -> None:
+    assert faults(honest[:1]) == [Fault(1, "its experiment lacks 1 of 2 samples, such as '1.png'")]
+    assert faults([*honest[:2], honest[0]]) == [Fault(3, "the same sample of the same experiment as line 1")]
     failed = honest[0] | {"status": "failed", "reason": "tired", "metrics": {}, "seconds": None}
     assert faults([failed, *honest[:2]]) == []
 
@@ -188,44 +192,48 @@ def test_numbers_too_large_for_a_double(faults: Callable[..., list[Fault]], hone
     assert Fault(1, "seconds: not finite") in faults(text)
 
 
-def test_command(honest: Lines, place: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.slow
+def test_command(honest: Lines, folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "records.jsonl"
     path.write_text(json.dumps(honest[0] | {"sample": "\x1b[31m\n::error::"}) + "\n")
-    (dictionary,) = map(str, place.glob("dictionary-*.safetensors"))
-    beside = ["--images", str(place / "album"), "--file", dictionary, "--sample", "0"]
+    (dictionary,) = map(str, folder.glob("dictionary-*.safetensors"))
+    beside = ["--images", str(folder / "album"), "--file", dictionary, "--sample", "0"]
     assert cli.main(["submit-check", str(path), *beside]) == 1
-    shown, told = capfd.readouterr()
-    assert all(line.startswith("line 1: ") for line in shown.splitlines())
-    assert "\x1b" not in shown
-    assert "faults in 1 records" in told
+    output, messages = capfd.readouterr()
+    assert all(line.startswith("line 1: ") for line in output.splitlines())
+    assert "\x1b" not in output
+    assert "faults in 1 records" in messages
     path.write_text("".join(json.dumps(records.seal(record)) + "\n" for record in honest))
     assert cli.main(["submit-check", str(path), *beside]) == 0
     assert cli.main(["submit-check", str(tmp_path / "absent")]) == 2
     assert cli.main(["submit-check", str(path), "--file", str(path)]) == 2
 
 
-# ---- the other process
+# ---- the attack process
 
 
-def seen(needs: frozenset[type[Knowledge]]) -> View:
+def build_view(needs: frozenset[type[Knowledge]]) -> View:
     """A release with others beside it, and a database."""
     known = {
-        OtherReleases: lambda: OtherReleases(draw=lambda count: iter([released(seed) for seed in range(count)])),
+        OtherReleases: lambda: OtherReleases(draw=lambda count: iter([build_release(seed) for seed in range(count)])),
         PublicDatabase: lambda: PublicDatabase(words=np.zeros((3, 128), np.uint8)),
     }
-    return View(release=released(0), defense=Affine(), extractor=Sift(), knowledge={what: known[what] for what in needs})
+    return View(release=build_release(0), defense=Affine(), extractor=Sift(), knowledge={what: known[what] for what in needs})
 
 
-def released(seed: int) -> Subspaces:
+def build_release(seed: int) -> Subspaces:
     rng = np.random.default_rng(seed)
     bases = np.linalg.qr(rng.normal(size=(5, 128, 2)))[0].transpose(0, 2, 1).astype(np.float32)
     return Subspaces(
-        positions=Points(keypoints=np.zeros((5, 2), np.float32)), size=(9, 9), origins=rng.normal(size=(5, 128)).astype(np.float32), bases=bases
+        positions=Points(keypoints=np.zeros((5, 2), np.float32)),
+        size=(9, 9),
+        origins=rng.normal(size=(5, 128)).astype(np.float32),
+        bases=bases,
     )
 
 
-def summed(view: View, rng: np.random.Generator) -> np.ndarray:
-    """Uses all that it is given, and tells what it has not been given."""
+def sum_releases(view: View, rng: np.random.Generator) -> np.ndarray:
+    """Use all knowledge of the view, and note what is refused."""
     others = list(view.know(OtherReleases).draw(3))
     view.notes.append(f"{len(view.know(PublicDatabase).words)} words")
     try:
@@ -235,16 +243,17 @@ def summed(view: View, rng: np.random.Generator) -> np.ndarray:
     return np.asarray(sum(other.origins for other in others) + rng.normal(size=(5, 128)), np.float32)
 
 
-def broken(view: View, rng: np.random.Generator) -> np.ndarray:
+def fail(view: View, rng: np.random.Generator) -> np.ndarray:
     raise ArithmeticError("lost count")
 
 
-def test_the_other_process_does_as_this_one() -> None:
+@pytest.mark.slow
+def test_the_attack_process_gives_the_same_result() -> None:
     needs = frozenset({OtherReleases, PublicDatabase})
-    here, there = seen(needs), seen(needs)
+    local, remote = build_view(needs), build_view(needs)
     one, other = np.random.default_rng(3), np.random.default_rng(3)
-    assert np.array_equal(execute_in_attack_process(summed, there, other), summed(here, one))
-    assert here.notes == there.notes == ["3 words", "this attack did not declare DefenseDatabase in its `needs`"]
+    assert np.array_equal(execute_in_attack_process(sum_releases, remote, other), sum_releases(local, one))
+    assert local.notes == remote.notes == ["3 words", "this attack did not declare DefenseDatabase in its `needs`"]
     assert one.random() == other.random()
 
 
@@ -259,13 +268,14 @@ def test_the_map_comes_without_the_queries(tmp_path: Path) -> None:
     """One of which is the secret."""
     whole = write_scene(tmp_path)
     public = Public(scene_index=SceneIndex(whole, Sift()))
-    asked = seen(frozenset())
+    view = build_view(frozenset())
     served = Server(public=public, camera=whole.queries[0].camera)
-    asked = dataclasses.replace(asked, knowledge={ServerMap: lambda: ServerMap(server=served)})
-    found = execute_in_attack_process(camera_and_references, asked, np.random.default_rng(0))
-    assert found.tolist() == [np.float32(75.1), len(whole.references), 1]
+    view = dataclasses.replace(view, knowledge={ServerMap: lambda: ServerMap(server=served)})
+    result = execute_in_attack_process(camera_and_references, view, np.random.default_rng(0))
+    assert result.tolist() == [np.float32(75.1), len(whole.references), 1]
 
 
-def test_errors_come_back() -> None:
+@pytest.mark.slow
+def test_errors_of_the_attack_process_are_raised() -> None:
     with pytest.raises(RuntimeError, match="lost count"):
-        execute_in_attack_process(broken, seen(frozenset()), np.random.default_rng(0))
+        execute_in_attack_process(fail, build_view(frozenset()), np.random.default_rng(0))

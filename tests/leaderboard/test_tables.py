@@ -1,20 +1,30 @@
-"""Tables and figures that are made from records."""
+"""Tables and figures of records."""
 
+import csv
 import io
 import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import pytest
 from record_lines import record
 from rich.console import Console
 from scipy import stats
 
+from bench.core.table import Table, to_csv, to_markdown, to_terminal
 from leaderboard import figures, tables
 
 SIFT = {"name": "sift", "upright": True}
+
+
+def show(table: Table, row: int) -> dict[str, str]:
+    """The texts of a row by the labels of their columns."""
+    return dict(zip((column.label for column in table.columns), table.rows[row].texts, strict=True))
+
+
+def show_markdown(table: Table) -> str:
+    return to_markdown(table, plain=True)
 
 
 NA = record("*", run_hash="n", attack={"name": "nearest"}, status="n/a", reason="nearest attacks Subspaces", metrics={})
@@ -24,17 +34,18 @@ def test_metrics_are_averaged_over_photographs() -> None:
     metrics = {"mae": 0.3, "psnr": None, "ssim": 0.7, "keypoints": 300}
     other = record("b", metrics=metrics, privacy=record()["privacy"] | {"epsilon_image": 3000.0})
     (table,) = tables.build_tables([record(), other])
-    row = table.frame.iloc[0]
+    row = table.rows[0].values
     assert row["photographs"] == 2
     assert row["mae"] == pytest.approx(0.2)
     assert row["psnr"] == 20.0  # of the photographs that have one
     assert row["epsilon_image"] == 2000.0
-    assert table.metrics == ("keypoints", "mae", "ssim", "psnr")  # nothing has an angle
+    assert list(show(table, 0))[3:7] == ["keypoints", "MAE", "SSIM", "PSNR"]
+    assert "angle" not in row  # no record has one
 
 
-def localized(unit: str, recall: float, error: float | None) -> dict[str, Any]:
+def localized(sample: str, recall: float, error: float | None) -> dict[str, Any]:
     metrics = {"recall_0.25m_2deg": recall, "translation_error": error}
-    return record(unit, task="localization", attack=None, metrics=metrics)
+    return record(sample, task="localization", attack=None, metrics=metrics)
 
 
 def test_a_query_that_was_not_localized_is_the_worst_of_the_median() -> None:
@@ -42,28 +53,31 @@ def test_a_query_that_was_not_localized_is_the_worst_of_the_median() -> None:
     queries = [localized("a", 1.0, 0.1), localized("b", 1.0, 0.3), localized("c", 0.0, None), localized("d", 0.0, None)]
     (half,) = tables.build_tables(queries)
     (most,) = tables.build_tables([*queries, localized("e", 1.0, 0.2)])
-    assert half.frame.iloc[0]["translation_error"] == math.inf
-    assert most.frame.iloc[0]["translation_error"] == pytest.approx(0.3)
-    assert "| median translation_error |" in tables.to_markdown(half)
-    assert "| ∞ |" in tables.to_markdown(half)
+    assert half.rows[0].values["translation_error"] == math.inf
+    assert most.rows[0].values["translation_error"] == pytest.approx(0.3)
+    assert "| median translation_error |" in show_markdown(half)
+    assert "| ∞ |" in show_markdown(half)
 
 
-def test_shares_have_wilson_s_interval() -> None:
+def test_fractions_have_wilsons_interval() -> None:
     (table,) = tables.build_tables(
         [localized(str(number), float(number < 7), 0.1) for number in range(10)] + [NA | {"task": "localization"}]
     )
     expected = stats.binomtest(7, 10).proportion_ci(0.95, "wilson")
-    row = table.frame.iloc[0]
-    assert (row["recall_0.25m_2deg_low"], row["recall_0.25m_2deg_high"]) == pytest.approx((expected.low, expected.high))
-    shown = tables.rendered(table)["recall_0.25m_2deg"]
-    assert list(shown) == [f"0.7 [{expected.low:.4g}, {expected.high:.4g}]", "n/a"]
+    row = table.rows[0].values
+    recall = row["recall_0.25m_2deg"]
+    assert (recall.low, recall.high) == pytest.approx((expected.low, expected.high))
+    assert [show(table, index)["recall_0.25m_2deg"] for index in range(2)] == [
+        f"0.7 [{expected.low:.4g}, {expected.high:.4g}]",
+        "n/a",
+    ]
 
 
 def test_the_smaller_of_two_compositions_is_shown() -> None:
     optimal = record("b", privacy=record()["privacy"] | {"epsilon_image": 3000.0, "epsilon_image_optimal": 2500.0})
     (table,) = tables.build_tables([optimal])
-    assert table.frame.iloc[0]["epsilon_image"] == 2500.0
-    shown = tables.to_markdown(table)
+    assert table.rows[0].values["epsilon_image"] == 2500.0
+    shown = show_markdown(table)
     assert "2500" in shown
     assert "δ = 1e-06" in shown
     assert "Not covered: the keypoints' positions, the number of keypoints." in shown
@@ -72,13 +86,13 @@ def test_the_smaller_of_two_compositions_is_shown() -> None:
 def test_what_is_not_covered_beyond_that_is_noted() -> None:
     linked = record()["privacy"] | {"uncovered": ["the keypoints' positions", "which keypoints share a word"]}
     (table,) = tables.build_tables([record(privacy=linked)])
-    assert table.frame.iloc[0]["note"] == "not covered either: which keypoints share a word"
-    assert tables.build_tables([record()])[0].frame.iloc[0]["note"] == ""
+    assert table.rows[0].values["note"] == "not covered either: which keypoints share a word"
+    assert tables.build_tables([record()])[0].rows[0].values["note"] == ""
 
 
 def test_a_terminal_shows_how_many_keypoints_there_are() -> None:
-    drawn = tables.to_rich(tables.build_tables([record()])[0])
-    assert "keypoints" in [str(column.header) for column in drawn.columns]
+    (table,) = tables.build_tables([record()], brief=True)
+    assert "keypoints" in show(table, 0)
 
 
 def test_heading_states_what_was_measured() -> None:
@@ -86,80 +100,82 @@ def test_heading_states_what_was_measured() -> None:
     assert table.heading == "Reconstruction on photos (1 photograph), sift upright features, seed 0"
     oriented = record(run_hash="o", dataset={"name": "photos", "extractor": {"name": "sift", "upright": False}})
     assert [table.heading.count("oriented") for table in tables.build_tables([record(), oriented])] == [0, 1]
-    assert "not private" in tables.to_markdown(table)
+    assert "not private" in show_markdown(table)
 
 
 def test_what_does_not_apply_is_neither_blank_nor_zero() -> None:
     (table,) = tables.build_tables([record(), NA])
-    shown = tables.rendered(table)
-    assert list(shown.loc[1, ["n", "MAE", "SSIM", "PSNR"]]) == ["n/a"] * 4
-    assert shown.loc[1, "note"] == "nearest attacks Subspaces"
-    csv = pd.read_csv(io.StringIO(tables.to_csv([table])), keep_default_na=False)
-    assert csv.loc[1, "ssim"] == "n/a"
-    assert csv.loc[1, "photographs"] == "n/a"
-    assert csv.loc[0, "ssim"] == "0.5"
+    texts = show(table, 1)
+    assert [texts[label] for label in ("n", "MAE", "SSIM", "PSNR")] == ["n/a"] * 4
+    assert texts["note"] == "nearest attacks Subspaces"
+    first, second = csv.DictReader(io.StringIO(to_csv(table)))
+    assert (second["ssim"], second["photographs"]) == ("n/a", "n/a")
+    assert first["ssim"] == "0.5"
 
 
-def test_failures_are_counted_and_told() -> None:
+def test_failures_are_counted_and_listed() -> None:
     failed = record("b", status="failed", reason="b.jpg: truncated", metrics={})
     (table,) = tables.build_tables([record(), failed])
-    assert (table.frame.loc[0, "photographs"], table.frame.loc[0, "failed"]) == (1, 1)
-    assert "failed: b, ldp:epsilon=10, dia: b.jpg: truncated" in tables.to_markdown(table)
+    assert (table.rows[0].values["photographs"], table.rows[0].values["failed"]) == (1, 1)
+    assert "failed: b, ldp:epsilon=10, dia: b.jpg: truncated" in show_markdown(table)
     (all_failed,) = tables.build_tables([failed])
-    assert all_failed.frame.loc[0, "note"] == "no photograph could be done"
+    assert all_failed.rows[0].values["note"] == "no photograph could be done"
 
 
-def test_later_record_of_a_unit_replaces_the_earlier() -> None:
+def test_later_record_of_a_sample_replaces_the_earlier() -> None:
     failed = record(status="failed", reason="x", metrics={})
     (table,) = tables.build_tables([failed, record()])
-    assert (table.frame.loc[0, "photographs"], table.frame.loc[0, "failed"]) == (1, 0)
+    assert (table.rows[0].values["photographs"], table.rows[0].values["failed"]) == (1, 0)
 
 
-def test_labels_show_digests_only_where_they_tell_apart() -> None:
+def test_labels_show_digests_only_where_they_would_be_equal() -> None:
     one, other = record(), record(defense=record()["defense"] | {"dictionary": "sha256:fedcba9876"}, run_hash="o")
     (table,) = tables.build_tables([one, other])
-    assert list(table.frame["defense"]) == ["ldp:epsilon=10,dictionary=01234567", "ldp:epsilon=10,dictionary=fedcba98"]
+    assert [row.values["defense"] for row in table.rows] == [
+        "ldp:epsilon=10,dictionary=01234567",
+        "ldp:epsilon=10,dictionary=fedcba98",
+    ]
     (table,) = tables.build_tables([one, NA])
-    assert list(table.frame["defense"]) == ["ldp:epsilon=10"] * 2
+    assert [row.values["defense"] for row in table.rows] == ["ldp:epsilon=10"] * 2
 
 
-@pytest.mark.parametrize(
-    ("log10", "shown"), [(-0.8332, "0.1468"), (0.0, "1"), (-612.25, "10^-612.2"), (math.nan, "n/a"), (None, "n/a")]
-)
+@pytest.mark.parametrize(("log10", "shown"), [(-0.8332, "0.1468"), (0.0, "1"), (-612.25, "10^-612.2"), (None, "n/a")])
 def test_chances_too_small_for_a_float_are_shown(log10: float | None, shown: str) -> None:
     (table,) = tables.build_tables([record(privacy=record()["privacy"] | {"log10_true": log10})])
-    assert tables.rendered(table).loc[0, "Pr(true)"] == shown
+    assert show(table, 0)["Pr(true)"] == shown
 
 
 def test_infinite_epsilon_is_shown() -> None:
     privacy = record()["privacy"] | {"epsilon_descriptor": "inf", "epsilon_image": "inf"}
     (table,) = tables.build_tables([record(privacy=privacy)])
-    assert tables.rendered(table).loc[0, "ε/descriptor"] == "∞"
-    assert tables.rendered(table).loc[0, "ε/image"] == "∞"
+    assert show(table, 0)["ε/descriptor"] == "∞"
+    assert show(table, 0)["ε/image"] == "∞"
 
 
-def test_terminal_and_markdown_show_the_same_cells() -> None:
+def test_terminal_and_markdown_show_the_same_values() -> None:
     (table,) = tables.build_tables([record(), NA])
+    (brief,) = tables.build_tables([record(), NA], brief=True)
     console = Console(file=io.StringIO(), width=300)
-    console.print(tables.to_rich(table))
-    drawn = console.file.getvalue()  # type: ignore[attr-defined]
-    for cell in tables.rendered(table).to_numpy().ravel():
-        assert cell in drawn
-        assert cell in tables.to_markdown(table)
+    console.print(to_terminal(brief))
+    terminal = console.file.getvalue()  # type: ignore[attr-defined]
+    for text in (text for row in table.rows for text in row.texts):
+        assert text in terminal
+        assert text in show_markdown(table)
 
 
 def test_pipe_in_a_reason_does_not_break_markdown() -> None:
     (table,) = tables.build_tables([NA | {"reason": "a|b\nc"}])
-    assert r"a\|b c" in tables.to_markdown(table)
+    assert r"a\|b c" in show_markdown(table)
 
 
+@pytest.mark.slow
 def test_figure_has_a_panel_for_each_record(tmp_path: Path) -> None:
     from PIL import Image
 
-    kept = tmp_path / "kept.png"
-    Image.fromarray(np.zeros((256, 256, 3), np.uint8)).save(kept)
+    image = tmp_path / "image.png"
+    Image.fromarray(np.zeros((256, 256, 3), np.uint8)).save(image)
     failed = record(status="failed", reason="too $dark$ " * 20, run_hash="f", metrics={})
-    shown = figures.build_panels(np.zeros((256, 256, 3), np.uint8), [record(), failed], [kept, tmp_path / "absent"])
+    shown = figures.build_panels(np.zeros((256, 256, 3), np.uint8), [record(), failed], [image, tmp_path / "absent"])
     assert [panel.title for panel in shown] == ["original", "ldp:epsilon=10\ndia", "ldp:epsilon=10\ndia"]
     assert [panel.caption[:10] for panel in shown] == ["", "SSIM 0.500", "failed: to"]
     assert shown[2].pixels is None

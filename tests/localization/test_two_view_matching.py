@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fakes import draw_texture, build_trial
+from fakes import build_trial, draw_texture
 
 import bench
 from bench.api import Defense
@@ -20,7 +20,7 @@ from bench.rendering.homographies import Pair
 from bench.settings import Asset
 from bench.task_api import Outcome
 from bench.tasks.matching import ACCURACY_LIMITS, Matching, compute_accuracy, transfer
-from bench.testing import shot
+from bench.testing import build_image
 from bench.types import Features, Release
 from defenses.affine import Affine
 from defenses.ldp import LDP
@@ -55,14 +55,14 @@ def test_measures_by_enumeration(rng: np.random.Generator) -> None:
     assert 0 < len(right) < len(possible) < 40
 
 
-def test_where_nothing_is_matched_all_is_zero() -> None:
+def test_all_measures_are_zero_without_matches() -> None:
     points = np.array([[5, 5], [9, 9]], np.float32)
     found = compute_accuracy(points, points, np.eye(3), np.empty((0, 2), np.int64))
     assert (found["precision"], found["recall"], found["mma_10px"], found["matches"]) == (0, 0, 0, 0)
     assert compute_accuracy(points, points + 50, np.eye(3), np.empty((0, 2), np.int64))["recall"] is None
 
 
-def test_points_beyond_the_horizon_have_no_place() -> None:
+def test_points_beyond_the_horizon_have_no_position() -> None:
     behind = np.array([[1, 0, 0], [0, 1, 0], [-0.1, 0, 1.0]])
     found = transfer(np.array([[5, 5], [10, 5], [20, 5]], np.float32), behind)
     assert np.isfinite(found[0]).all()
@@ -81,7 +81,7 @@ def test_words_in_common_by_enumeration(rng: np.random.Generator, unique: bool) 
     assert 0 < len(expected) < 15 * 12
 
 
-def test_words_in_common_where_there_is_little() -> None:
+def test_words_in_common_of_small_sets() -> None:
     none, some = np.empty((0, 3), dtype=np.int64), np.array([[1, 2, 3], [1, 4, 5]])
     assert (
         find_shared_words(none, some).shape
@@ -93,7 +93,7 @@ def test_words_in_common_where_there_is_little() -> None:
     assert find_shared_words(some, some).tolist() == [[0, 0], [0, 1], [1, 0], [1, 1]]
 
 
-def released(defense: Defense, secret: Features = SECRET, seed: int = 0) -> Release:
+def release_features(defense: Defense, secret: Features = SECRET, seed: int = 0) -> Release:
     return defense.protect(secret, Public(), np.random.default_rng(seed))
 
 
@@ -109,66 +109,70 @@ DEFENSES: list[Callable[[Asset], Defense]] = [
 @pytest.mark.parametrize("both", [False, True])
 def test_the_same_features_match_themselves(words: Asset, defense: Callable[[Asset], Defense], both: bool) -> None:
     plugin = defense(words)
-    second = released(plugin, seed=1) if both else two_view_matching.prepare_unprotected(SECRET, plugin, Public())
-    found = {tuple(pair) for pair in two_view_matching.match_releases(released(plugin), second).tolist()}
+    second = release_features(plugin, seed=1) if both else two_view_matching.prepare_unprotected(SECRET, plugin, Public())
+    found = {tuple(pair) for pair in two_view_matching.match_releases(release_features(plugin), second).tolist()}
     assert len({(i, i) for i in range(60)} & found) > 55
     assert len(found) < 120
 
 
 @pytest.mark.parametrize("defense", DEFENSES)
-def test_strangers_do_not_match_more_than_chance(words: Asset, defense: Callable[[Asset], Defense]) -> None:
+def test_shuffled_features_match_at_chance(words: Asset, defense: Callable[[Asset], Defense]) -> None:
     """Negative control: descriptors in another order."""
     plugin, shuffled = defense(words), SECRET.take(np.random.default_rng(0).permutation(60))
-    found = two_view_matching.match_releases(released(plugin), two_view_matching.prepare_unprotected(shuffled, plugin, Public()))
+    found = two_view_matching.match_releases(
+        release_features(plugin), two_view_matching.prepare_unprotected(shuffled, plugin, Public())
+    )
     assert (found[:, 0] == found[:, 1]).mean() < 0.15
 
 
-def judged(task: Matching, defense: Defense, secrets: tuple[Features, Features], homography: np.ndarray) -> Outcome:
-    """What a task says of a pair without photographs."""
-    made = build_trial(defense, secrets[0])
-    other = shot(secrets[1], released(defense, secrets[1], seed=5))
+def evaluate(task: Matching, defense: Defense, secrets: tuple[Features, Features], homography: np.ndarray) -> Outcome:
+    """Evaluate a pair without photographs."""
+    base = build_trial(defense, secrets[0])
+    other = build_image(secrets[1], release_features(defense, secrets[1], seed=5))
     nowhere = File(path=Path("none"), size=(1, 1))
     pair = Pair(name="pair", first=nowhere, second=nowhere, homography=homography)
-    unit = replace(made.sample, subject=pair)
-    return task.evaluate(replace(made, sample=unit, images=(*made.images, other)))
+    sample = replace(base.sample, subject=pair)
+    return task.evaluate(replace(base, sample=sample, images=(*base.images, other)))
 
 
-def seen_again(homography: np.ndarray) -> tuple[Features, Features]:
+def create_matching_features(homography: np.ndarray) -> tuple[Features, Features]:
     keypoints = np.random.default_rng(0).uniform(0, 300, (60, 2)).astype(np.float32)
     first = replace(SECRET, keypoints=keypoints)
     return first, replace(SECRET, keypoints=transfer(keypoints, homography).astype(np.float32))
 
 
 @pytest.mark.parametrize("homography", [np.eye(3), TURN])
-def test_features_that_are_seen_again_give_everything(homography: np.ndarray) -> None:
-    found = judged(Matching(), Undefended(), seen_again(homography), homography).metrics
+def test_matching_features_score_one(homography: np.ndarray) -> None:
+    found = evaluate(Matching(), Undefended(), create_matching_features(homography), homography).metrics
     assert (found["precision"], found["recall"], found["mma_01px"], found["matches"]) == (1, 1, 1, 60)
 
 
 def test_shuffled_positions_give_chance() -> None:
     """Negative control."""
-    first, second = seen_again(np.eye(3))
+    first, second = create_matching_features(np.eye(3))
     shuffled = replace(second, keypoints=np.random.default_rng(1).permutation(second.keypoints))
-    found = judged(Matching(), Undefended(), (first, shuffled), np.eye(3)).metrics
+    found = evaluate(Matching(), Undefended(), (first, shuffled), np.eye(3)).metrics
     assert found["matches"] == 60
     assert found["precision"] < 0.1
 
 
 def test_another_dictionary_matches_nothing(tmp_path: Path, words: Asset) -> None:
-    """Negative control: the same numbers stand for other words."""
-    release = released(LDP(dictionary=words, epsilon=20.0))
-    stranger = LDP(dictionary=write_dictionary(tmp_path, 5_000, seed=7), epsilon=20.0)
-    assert len(two_view_matching.match_releases(release, two_view_matching.prepare_unprotected(SECRET, stranger, Public()))) < 10
+    """Negative control: the same numbers denote other words."""
+    release = release_features(LDP(dictionary=words, epsilon=20.0))
+    other = LDP(dictionary=write_dictionary(tmp_path, 5_000, seed=7), epsilon=20.0)
+    assert len(two_view_matching.match_releases(release, two_view_matching.prepare_unprotected(SECRET, other, Public()))) < 10
 
 
 def test_ratio_test_leaves_fewer_and_better_matches() -> None:
     first, second = draw_features(60, seed=1), draw_features(80, seed=2)
-    all_of_them = two_view_matching.match_releases(released(Undefended(), first), released(Undefended(), second))
-    strict = two_view_matching.match_releases(released(Undefended(), first), released(Undefended(), second), ratio=0.8)
+    all_of_them = two_view_matching.match_releases(release_features(Undefended(), first), release_features(Undefended(), second))
+    strict = two_view_matching.match_releases(
+        release_features(Undefended(), first), release_features(Undefended(), second), ratio=0.8
+    )
     assert {tuple(pair) for pair in strict} < {tuple(pair) for pair in all_of_them}
 
 
-def test_runs_on_hpatches_and_on_pairs_that_are_made(tmp_path: Path) -> None:
+def test_runs_on_hpatches(tmp_path: Path) -> None:
     (tmp_path / "v_wall").mkdir()
     for number in range(1, 7):
         draw_texture(0, (160, 128)).save(tmp_path / "v_wall" / f"{number}.ppm")
@@ -178,7 +182,7 @@ def test_runs_on_hpatches_and_on_pairs_that_are_made(tmp_path: Path) -> None:
     assert all(record["metrics"]["recall"] == record["metrics"]["mma_01px"] == 1 for record in records)
 
 
-def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
+def test_invalid_settings_and_inputs_are_refused(tmp_path: Path) -> None:
     for wrong in ({"ratio": 0.0}, {"ratio": 1.1}, {"ratio": float("nan")}, {"each": 0}):
         with pytest.raises(UserError, match="must be"):
             Matching(**wrong)

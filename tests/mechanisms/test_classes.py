@@ -1,4 +1,4 @@
-"""Classes drawn exactly, against rational arithmetic, against numbers that are given bit by bit, and in their frequencies."""
+"""Exact draws of classes against rational arithmetic, given bits and expected frequencies."""
 
 import math
 from fractions import Fraction
@@ -26,15 +26,15 @@ def exp_bounds(power: Fraction, terms: int = 120) -> tuple[Fraction, Fraction]:
 
 
 def compute_reference_edges(counts: list[int], powers: list[Fraction], bits: int) -> list[int]:
-    """What `edges` returns, from rationals alone."""
+    """The result of `edges`, from rationals alone."""
     least = min(powers)
     bounds = [exp_bounds(power - least) for power in powers]
     found = []
-    for place in range(1, len(counts)):
+    for index in range(1, len(counts)):
         ends = []
-        for mine, theirs in ((0, 1), (1, 0)):
-            below = sum(count * bound[mine] for count, bound in zip(counts[:place], bounds[:place], strict=True))
-            above = sum(count * bound[theirs] for count, bound in zip(counts[place:], bounds[place:], strict=True))
+        for lower, upper in ((0, 1), (1, 0)):
+            below = sum(count * bound[lower] for count, bound in zip(counts[:index], bounds[:index], strict=True))
+            above = sum(count * bound[upper] for count, bound in zip(counts[index:], bounds[index:], strict=True))
             ends.append(math.floor(below / (below + above) * 2**bits))
         assert ends[0] == ends[1], "the reference is not fine enough"
         found.append(ends[0])
@@ -48,7 +48,7 @@ def compute_reference_edges(counts: list[int], powers: list[Fraction], bits: int
     bits=st.sampled_from([1, 64, 128]),
 )
 def test_edges_against_rational_arithmetic(counts: list[int], step: Fraction, bits: int) -> None:
-    powers = [step * place for place in range(len(counts))]
+    powers = [step * index for index in range(len(counts))]
     assert edges(counts, powers, bits) == compute_reference_edges(counts, powers, bits)
 
 
@@ -62,7 +62,7 @@ def test_two_classes_are_the_coin_of_the_subset_mechanism() -> None:
 def test_special_cases() -> None:
     assert edges([0, 3, 0], [Fraction(1), Fraction(2), Fraction(3)], 64) == [0, 2**64]
     assert edges([1, 2], [Fraction(5)] * 2, 8) == [2**8 // 3]
-    assert edges([1, 0, 1], [Fraction(0), Fraction(10**9), Fraction(0)], 8) == [2**7, 2**7]  # of an empty class
+    assert edges([1, 0, 1], [Fraction(0), Fraction(10**9), Fraction(0)], 8) == [2**7, 2**7]  # an empty class
     assert edges([1, 1], [Fraction(0), Fraction(10**6)], 64) == [0]
     assert edges([1, 1], [Fraction(10**6), Fraction(0)], 64) == [2**64 - 1]  # below 1, however little
     below, above = exponentials((Fraction(-1, 3),), 200)[0]
@@ -83,14 +83,14 @@ class Scripted:
         return np.array(taken, dtype=np.uint64) if size else taken[0]
 
 
-def test_draw_goes_on_where_bits_equal_those_of_an_edge() -> None:
+def test_draw_continues_where_bits_equal_those_of_an_edge() -> None:
     counts, powers = [5, 7, 11], [Fraction(0), Fraction(1, 2), Fraction(1)]
     first, second = edges(counts, powers, 64), edges(counts, powers, 192)
     words = [[edge >> shift & (2**64 - 1) for shift in (128, 64, 0)] for edge in second]
-    for place in (0, 1):
-        assert words[place][0] == first[place]
-        for last, expected in ((words[place][2] - 1, place), (words[place][2] + 1, place + 1)):
-            rng = Scripted(first[place], words[place][1], last)
+    for index in (0, 1):
+        assert words[index][0] == first[index]
+        for last, expected in ((words[index][2] - 1, index), (words[index][2] + 1, index + 1)):
+            rng = Scripted(first[index], words[index][1], last)
             assert draw_classes([counts], powers, np.zeros(1, dtype=np.int64), rng)[0] == expected  # type: ignore[arg-type]
             assert rng.numbers == []
     rng = Scripted(0, first[0] - 1, first[0] + 1, first[1] + 1, 2**64 - 1)
@@ -104,16 +104,16 @@ def test_frequencies(powers: list[int]) -> None:
     for profile in (0, 1):
         expected = chances(np.array(profiles[profile]), powers)
         np.testing.assert_allclose(expected.sum(), 1)
-        seen = np.bincount(drawn[which == profile], minlength=3)
+        observed = np.bincount(drawn[which == profile], minlength=3)
         used = expected > 0
-        assert seen[~used].sum() == 0
-        assert stats.chisquare(seen[used], 30_000 * expected[used]).pvalue > ALPHA
+        assert observed[~used].sum() == 0
+        assert stats.chisquare(observed[used], 30_000 * expected[used]).pvalue > ALPHA
         other = chances(np.array(profiles[1 - profile]), powers)[used] + 1e-9  # the control
-        assert stats.chisquare(seen[used], 30_000 * other / other.sum()).pvalue < CERTAINLY_WRONG
+        assert stats.chisquare(observed[used], 30_000 * other / other.sum()).pvalue < CERTAINLY_WRONG
 
 
 def test_numbers_of_any_size() -> None:
-    """As `plateau` has them: numbers of sets."""
+    """Like the numbers of sets of `plateau`."""
     counts = [math.comb(256_000, 16) * 3, math.comb(256_000, 16)]
     drawn = draw_classes([counts], [Fraction(0)] * 2, np.zeros(20_000, dtype=np.int64), np.random.default_rng(0))
     assert stats.binomtest(int((drawn == 0).sum()), 20_000, 0.75).pvalue > ALPHA

@@ -1,4 +1,4 @@
-"""What many answers cost together, against the definition, against sixty digits, and against Google's accountant."""
+"""Composition against the definition, sixty digits and Google's accountant."""
 
 import itertools
 import math
@@ -39,7 +39,7 @@ def test_against_the_definition(epsilon: float, answers: int, delta: float) -> N
     assert compose_optimal(epsilon, answers, delta) == pytest.approx(least_epsilon(epsilon, answers, delta), rel=1e-9, abs=1e-12)
 
 
-def test_control_what_is_less_is_too_little() -> None:
+def test_control_other_values_of_delta_differ() -> None:
     assert compose_optimal(0.5, 10, 0.01) > 1.01 * least_epsilon(0.5, 10, 0.02)
     assert compose_optimal(0.5, 10, 0.01) < 0.99 * least_epsilon(0.5, 10, 0.005)
 
@@ -69,7 +69,7 @@ def test_against_sixty_digits(epsilon: float, answers: int) -> None:
 
 @pytest.mark.parametrize(("epsilon", "answers"), [(1.0, 50), (0.5, 200), (0.02, 3000)])
 def test_against_googles_accountant(epsilon: float, answers: int) -> None:
-    """Of randomised responses. It rounds each loss up to a multiple of a step."""
+    """For randomised responses. The accountant rounds each loss up to a multiple of a step."""
     from dp_accounting.pld import privacy_loss_distribution
 
     step = epsilon / 1000
@@ -108,12 +108,12 @@ def test_special_cases() -> None:
 
 @pytest.mark.parametrize("answers", [1, 565, 10_000])
 @pytest.mark.parametrize("total", [1e-3, 10.0, 5650.0, 1e6])
-def test_what_is_left_costs_the_total(total: float, answers: int) -> None:
+def test_solved_epsilon_composes_to_the_total(total: float, answers: int) -> None:
     for cost in (compose_basic, compose_optimal, compose):
         assert cost(solve_epsilon(total, answers, cost), answers) == pytest.approx(total, rel=1e-6)
     assert solve_epsilon(total, answers) >= float(Fraction(total) / answers) * (1 - 1e-9)
 
 
-def test_nothing_and_everything_are_left_of_themselves() -> None:
+def test_zero_and_infinite_totals() -> None:
     assert solve_epsilon(0.0, 10) == 0.0
     assert math.isinf(solve_epsilon(math.inf, 10))

@@ -1,4 +1,4 @@
-"""Words drawn by levels: `exponential` and `metric-ldp` against enumeration and their proofs; broken ones are caught."""
+"""Draws by levels: `exponential` and `metric-ldp` against enumeration and their proofs; broken variants are detected."""
 
 import dataclasses
 import json
@@ -36,16 +36,16 @@ ALPHA = 1e-4
 
 
 def chances(weights: np.ndarray, size: int) -> dict[tuple[int, ...], float]:
-    """Of all sets, when words are drawn one after the other from those that are left."""
-    found: dict[tuple[int, ...], float] = {}
+    """Chances of all sets, when words are drawn one at a time without replacement."""
+    sets: dict[tuple[int, ...], float] = {}
     for order in permutations(range(len(weights)), size):
         chance, left = 1.0, float(weights.sum())
         for word in order:
             chance *= weights[word] / left
             left -= weights[word]
         key = tuple(sorted(order))
-        found[key] = found.get(key, 0.0) + chance
-    return found
+        sets[key] = sets.get(key, 0.0) + chance
+    return sets
 
 
 @pytest.mark.parametrize("size", [1, 2, 3])
@@ -56,13 +56,13 @@ def test_words_against_enumeration(size: int) -> None:
     cosines = unit @ unit[3]
     borders = np.quantile(cosines, [0.3, 0.6, 0.9])
     powers = [Fraction(level, 2) for level in range(4)]
-    drawn = draw_graded_words(Neighbours(codes), np.full(draws, 3), borders, powers, size, np.random.default_rng(0))
-    assert (np.diff(drawn, axis=1) > 0).all()
-    seen = Counter(map(tuple, drawn.tolist()))
+    words = draw_graded_words(Neighbours(codes), np.full(draws, 3), borders, powers, size, np.random.default_rng(0))
+    assert (np.diff(words, axis=1) > 0).all()
+    observed = Counter(map(tuple, words.tolist()))
     levels = (cosines[:, None] >= borders - 1e-12).sum(axis=1)
     for scale, right in ((1.0, True), (1.2, False)):
         expected = chances(np.exp(scale * levels / 2), size)
-        p = stats.chisquare([seen[Z] for Z in expected], [draws * chance for chance in expected.values()]).pvalue
+        p = stats.chisquare([observed[Z] for Z in expected], [draws * chance for chance in expected.values()]).pvalue
         assert p > ALPHA if right else p < 1e-6
 
 
@@ -100,23 +100,23 @@ def test_metric_ldp_has_the_law_of_its_docstring(tmp_path: Path) -> None:
     np.testing.assert_allclose(
         measure_frequencies(defense, secrets, public, 20_000), weights / weights.sum(1, keepdims=True), atol=0.02
     )
-    # The metric that the promise is made in covers the rounded distances, and is one.
-    promised = np.array([[float(defense.distance(secrets, public, i, j)) for j in range(12)] for i in range(12)])
-    assert (promised >= distances).all()
-    assert (promised <= distances + 0.25).all()
-    assert (promised[:, None] <= promised[:, :, None] + promised[None]).all()
-    assert np.abs(np.log(weights[:, None] / weights[None])).max() <= 5.0 / 2 * promised.max()
+    # The metric of the guarantee is at least the rounded distance, and is a metric.
+    metric = np.array([[float(defense.distance(secrets, public, i, j)) for j in range(12)] for i in range(12)])
+    assert (metric >= distances).all()
+    assert (metric <= distances + 0.25).all()
+    assert (metric[:, None] <= metric[:, :, None] + metric[None]).all()
+    assert np.abs(np.log(weights[:, None] / weights[None])).max() <= 5.0 / 2 * metric.max()
     ratios = np.log(weights / weights.sum(1, keepdims=True))
-    assert (np.abs(ratios[:, None] - ratios[None]).max(axis=2) <= 5.0 * promised + 1e-9).all()
+    assert (np.abs(ratios[:, None] - ratios[None]).max(axis=2) <= 5.0 * metric + 1e-9).all()
 
 
-def test_the_promise_by_distance_is_no_epsilon(tmp_path: Path) -> None:
-    promised = MetricLDP(dictionary=write_dictionary(tmp_path)).privacy(Public())
-    assert (promised.guarantee, promised.epsilon, promised.per_distance) == ("d-chi", None, 16.0)
+def test_a_guarantee_by_distance_is_no_epsilon(tmp_path: Path) -> None:
+    guarantee = MetricLDP(dictionary=write_dictionary(tmp_path)).privacy(Public())
+    assert (guarantee.guarantee, guarantee.epsilon, guarantee.per_distance) == ("d-chi", None, 16.0)
     assert Exponential(dictionary=write_dictionary(tmp_path)).distance(draw_features(2), Public(), 0, 1) == 1
 
 
-def test_it_never_stands_in_a_column_of_epsilons(tmp_path: Path) -> None:
+def test_a_guarantee_by_distance_is_in_no_epsilon_column(tmp_path: Path) -> None:
     """Neither in records, nor in tables, nor in a leaderboard's sheets, nor among budgets; and the records are of the schema."""
     small = write_dictionary(tmp_path)
     defenses = [MetricLDP(dictionary=small), Exponential(dictionary=small)]
@@ -130,11 +130,12 @@ def test_it_never_stands_in_a_column_of_epsilons(tmp_path: Path) -> None:
     for record in records:
         jsonschema.validate(record, schema)
     (table,) = tables.build_tables(records)
-    by_distance, by_epsilon = (row for _, row in tables.rendered(table).iterrows())
+    labels = [column.label for column in table.columns]
+    by_distance, by_epsilon = (dict(zip(labels, row.texts, strict=True)) for row in table.rows)
     assert (by_distance["ε/descriptor"], by_distance["ε/image"], by_epsilon["ε/descriptor"]) == ("n/a", "n/a", "10")
     assert by_distance["note"] == "another promise than ε-LDP: ε = 16 per unit of distance"
-    (board,) = comparison.build_groups(comparison.load_records(tmp_path / "run"))
-    rows = {row.cell.metadata["defense"]["name"]: row.values for row in group_tables.pairs(board).rows}
+    (group,) = comparison.build_groups(comparison.load_records(tmp_path / "run"))
+    rows = {row.experiment.metadata["defense"]["name"]: row.values for row in group_tables.build_pairs_table(group).rows}
     assert rows["metric-ldp"]["guarantee"] == "d_χ privacy, ε = 16 per unit of distance"
     assert rows["metric-ldp"]["epsilon_descriptor"] is None is rows["metric-ldp"]["epsilon_image"]
     assert rows["exponential"]["epsilon_descriptor"] == 10.0
@@ -144,7 +145,7 @@ def test_it_never_stands_in_a_column_of_epsilons(tmp_path: Path) -> None:
 # ---- the audit
 
 
-def test_they_keep_their_promises(tmp_path: Path) -> None:
+def test_guarantees_hold(tmp_path: Path) -> None:
     for defense in (Exponential(epsilon=2.0, floor=0.2), MetricLDP(epsilon=3.0), Exponential(epsilon=4.0, subset_size=3)):
         found = audit(defense, 64, 4000, 0, tmp_path)
         assert found.verdict == "consistent"
@@ -152,14 +153,14 @@ def test_they_keep_their_promises(tmp_path: Path) -> None:
     assert found.strongest.epsilon < 1
 
 
-def test_half_of_the_epsilon_of_exponential_is_for_normalisers_that_hardly_differ(tmp_path: Path) -> None:
+def test_exponential_uses_about_half_of_its_epsilon(tmp_path: Path) -> None:
     found = audit(Exponential(epsilon=Exact("1/3"), floor=0.3), 3, 400, 0, tmp_path).enumeration
     assert found is not None
     assert not found.exceeds
     assert 1 / 6 < found.low <= found.high < 1 / 5
 
 
-def test_enumeration_of_a_promise_by_distance(tmp_path: Path) -> None:
+def test_enumeration_of_a_guarantee_by_distance(tmp_path: Path) -> None:
     found = audit(MetricLDP(epsilon=2.0), 3, 400, 0, tmp_path).enumeration
     assert found is not None
     assert not found.exceeds
@@ -179,14 +180,14 @@ class WithoutTheTwo(Exponential):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class InOtherUnits(MetricLDP):
-    """Measures distance in eighths of what it promises by."""
+    """Measures distance in eighths of the unit of its guarantee."""
 
     def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> WordSets:
         sound = MetricLDP(epsilon=8 * self.epsilon, steps=self.steps, dictionary=self.dictionary)
         return sound.protect(secret, public, rng)
 
 
-def test_broken_ones_are_caught(tmp_path: Path) -> None:
+def test_broken_variants_are_detected(tmp_path: Path) -> None:
     found = audit(WithoutTheTwo(epsilon=Exact("1/3"), floor=0.3), 3, 400, 0, tmp_path)
     assert found.enumeration is not None
     assert found.enumeration.exceeds
@@ -195,7 +196,7 @@ def test_broken_ones_are_caught(tmp_path: Path) -> None:
     assert {finding.family for finding in found.findings if finding.certain_epsilon > 1.0} >= {"membership", "position"}
 
 
-# ---- what is asked
+# ---- configuration
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Protecting features for real: the generator, and devices that remember."""
+"""Protection for deployment: the generator, and devices with memoized defenses."""
 
 import os
 import stat
@@ -13,7 +13,7 @@ from bench.codebook.public import Public
 from bench.core.errors import UserError
 from bench.mechanisms import protection
 from bench.settings import Asset
-from bench.testing import same
+from bench.testing import are_equal
 from bench.types import Descriptors, WordSets
 from defenses.ldp import LDP
 from defenses.none import Undefended
@@ -30,25 +30,25 @@ def words(release: object) -> np.ndarray:
     return release.words
 
 
-def test_releases_are_drawn_afresh(small: Asset) -> None:
+def test_releases_are_independent(small: Asset) -> None:
     features, defense = draw_features(), LDP(dictionary=small)
-    assert not same(bench.protect(features, defense), bench.protect(features, defense))
+    assert not are_equal(bench.protect(features, defense), bench.protect(features, defense))
     assert isinstance(bench.protect(features, Undefended()), Descriptors)
 
 
 def test_the_key_is_the_operating_systems(small: Asset, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[int] = []
+    sizes: list[int] = []
 
-    def drawn(count: int) -> bytes:
-        asked.append(count)
+    def draw_bytes(count: int) -> bytes:
+        sizes.append(count)
         return b"\x07" * count
 
-    monkeypatch.setattr(protection.secrets, "token_bytes", drawn)
+    monkeypatch.setattr(protection.secrets, "token_bytes", draw_bytes)
     features, defense = draw_features(), LDP(dictionary=small)
     first, again = bench.protect(features, defense), bench.protect(features, defense)
-    assert asked == [32, 32]
-    assert same(first, again)  # a function of these bits alone
-    assert same(first, defense.protect(features, Public(), protection.create_generator(b"\x07" * 32)))
+    assert sizes == [32, 32]
+    assert are_equal(first, again)  # a function of these bits alone
+    assert are_equal(first, defense.protect(features, Public(), protection.create_generator(b"\x07" * 32)))
 
 
 def test_the_cipher_is_chacha20() -> None:
@@ -60,7 +60,7 @@ def test_the_cipher_is_chacha20() -> None:
     assert one.hex() == "4540f05a9f1fb296d7736e7b208e3c96eb4fe1834688d2604f450952ed432d41"
 
 
-# ---- a device that remembers
+# ---- memoized defenses
 
 
 def test_a_device_gives_equal_words_equal_answers(small: Asset, tmp_path: Path) -> None:
@@ -72,49 +72,49 @@ def test_a_device_gives_equal_words_equal_answers(small: Asset, tmp_path: Path) 
         assert len({tuple(row) for row in first[nearest == word].tolist()}) == 1
     reversed_features = features.take(np.arange(200)[::-1])
     np.testing.assert_array_equal(words(bench.protect(reversed_features, defense, device=key)), first[::-1])
-    # The controls: another device answers otherwise, and so does one that forgets.
+    # The controls: another device answers differently, and so does a defense without memoization.
     assert (words(bench.protect(features, defense, device=tmp_path / "other")) != first).any()
-    forgetful = LDP(dictionary=small)
-    assert (words(bench.protect(features, forgetful)) != words(bench.protect(features, forgetful))).any()
+    fresh = LDP(dictionary=small)
+    assert (words(bench.protect(features, fresh)) != words(bench.protect(features, fresh))).any()
 
 
 def test_another_configuration_is_another_table(small: Asset, tmp_path: Path) -> None:
-    """Under one key, the bits that say whether the true word is told would be the same at every ε."""
+    """Under one key, the bits that decide whether the true word is included would be the same at every ε."""
     features, key = draw_features(300), tmp_path / "key"
-    key.write_bytes(bytes(range(32)))  # one device: the share told is a matter of its draws
+    key.write_bytes(bytes(range(32)))  # one device: the fraction included depends on its draws
     rows = [words(bench.protect(features, LDP(dictionary=small, memoize=True, epsilon=e), device=key)) for e in (4.0, 4.01)]
     nearest = Public().nearest_words(small, features)
-    told = [(row == nearest[:, None]).any(axis=1) for row in rows]
-    assert 0.02 < told[0].mean() < 0.5
-    assert (told[0] != told[1]).mean() > 0.02
-    alike = [
+    included = [(row == nearest[:, None]).any(axis=1) for row in rows]
+    assert 0.02 < included[0].mean() < 0.5
+    assert (included[0] != included[1]).mean() > 0.02
+    equal_keys = [
         LDP(dictionary=small, memoize=True, epsilon=e).protect(features, Public(), protection.create_generator(key.read_bytes()))
         for e in (4.0, 4.01)
     ]
-    told = [(words(release) == nearest[:, None]).any(axis=1) for release in alike]
-    assert (told[0] != told[1]).mean() < 0.01  # the control: what would be
+    included = [(words(release) == nearest[:, None]).any(axis=1) for release in equal_keys]
+    assert (included[0] != included[1]).mean() < 0.01  # the control: one key for both
 
 
-def test_the_key_is_made_once_for_its_owner(small: Asset, tmp_path: Path) -> None:
+def test_the_key_is_created_once_for_its_owner(small: Asset, tmp_path: Path) -> None:
     defense, key = LDP(dictionary=small, memoize=True), tmp_path / "key"
     bench.protect(draw_features(), defense, device=key)
-    kept = key.read_bytes()
-    assert len(kept) == 32
-    assert len(set(kept)) > 8
+    key_bytes = key.read_bytes()
+    assert len(key_bytes) == 32
+    assert len(set(key_bytes)) > 8
     assert stat.S_IMODE(os.stat(key).st_mode) == 0o600
     bench.protect(draw_features(), defense, device=str(key))
-    assert key.read_bytes() == kept
+    assert key.read_bytes() == key_bytes
 
 
 def test_mistakes(small: Asset, tmp_path: Path) -> None:
-    features, remembering = draw_features(), LDP(dictionary=small, memoize=True)
+    features, memoized = draw_features(), LDP(dictionary=small, memoize=True)
     with pytest.raises(UserError, match=r"ldp, as configured, needs the file of the device's key: protect\(..., device=PATH\)"):
-        bench.protect(features, remembering)
-    with pytest.raises(UserError, match="ldp, as configured, does not remember"):
+        bench.protect(features, memoized)
+    with pytest.raises(UserError, match="ldp, as configured, is not memoized"):
         bench.protect(features, LDP(dictionary=small), device=tmp_path / "key")
     assert not (tmp_path / "key").exists()
     (tmp_path / "short").write_bytes(b"secret")
     with pytest.raises(UserError, match="short: a device's key has 32 bytes, this file 6"):
-        bench.protect(features, remembering, device=tmp_path / "short")
-    with pytest.raises(UserError, match="cannot make or read the device's key: No such file"):
-        bench.protect(features, remembering, device=tmp_path / "nowhere" / "key")
+        bench.protect(features, memoized, device=tmp_path / "short")
+    with pytest.raises(UserError, match="cannot create or read the device's key: No such file"):
+        bench.protect(features, memoized, device=tmp_path / "nowhere" / "key")

@@ -1,4 +1,4 @@
-"""How many words to release: the model against enumeration and against a simulation of what it models; and the command."""
+"""Choice of the subset size: the model against enumeration and simulation; and the command `bench subset-size`."""
 
 import json
 import math
@@ -20,19 +20,19 @@ from bench.mechanisms.subset_size import (
     compute_sample_chance,
     compute_selection_chance,
     estimate_sizes,
-    success,
+    estimate_success,
 )
 
 
 def test_matches_against_enumeration() -> None:
-    """Of a dictionary of 6 words and one keypoint, over all sets and all places of the other points."""
+    """Of a dictionary of 6 words and one keypoint, over all sets and all words of the other points."""
     domain, size, epsilon, points = 6, 2, 1.5, 3
     total = size * math.exp(epsilon) + domain - size
     right = wrong = 0.0
     for Z in combinations(range(domain), size):
         chance = domain * (math.exp(epsilon) if 0 in Z else 1.0) / total / math.comb(domain, size)  # word 0 is the true one
         right += chance * (0 in Z)
-        wrong += chance * points * len(Z) / domain  # a point with any word alike is met so often
+        wrong += chance * points * len(Z) / domain  # a point is equally likely to have any word
     (found,) = estimate_sizes(epsilon, domain, [size], Workload(keypoints=1, repeatability=[1.0], points=points))
     assert found.right == pytest.approx(right, rel=1e-12) == pytest.approx(found.inclusion, rel=1e-12)
     assert found.wrong == pytest.approx(wrong, rel=1e-12)
@@ -41,7 +41,7 @@ def test_matches_against_enumeration() -> None:
 def test_information_is_that_of_the_enumeration() -> None:
     """Σ_Z,v Pr(v) Pr(Z | v) ln(Pr(Z | v) / Pr(Z)), all Z being equally likely."""
     domain, epsilon = 6, 1.5
-    told = []
+    information = []
     for size in range(1, domain):
         total = size * math.exp(epsilon) + domain - size
         bits = 0.0
@@ -49,72 +49,72 @@ def test_information_is_that_of_the_enumeration() -> None:
             for v in range(domain):
                 relative = domain * (math.exp(epsilon) if v in Z else 1.0) / total  # Pr(Z | v) / Pr(Z)
                 bits += relative * math.log2(relative) / domain / math.comb(domain, size)
-        told.append(bits)
+        information.append(bits)
     found = estimate_sizes(epsilon, domain, range(1, domain), Workload())
-    assert [row.bits for row in found] == pytest.approx(told, rel=1e-9)
+    assert [row.bits for row in found] == pytest.approx(information, rel=1e-9)
     assert max(found, key=lambda row: row.bits).size == most_informative_size(epsilon, domain)
 
 
 def test_samples_against_enumeration() -> None:
     for right, wrong in ((3, 2), (5, 4), (2, 6), (4, 0)):
         samples = list(combinations(range(right + wrong), SAMPLE))
-        share = np.mean([max(sample) < right for sample in samples])  # matches are numbered, the right ones first
-        expected = 1 - (1 - share) ** 7
+        fraction = np.mean([max(sample) < right for sample in samples])  # matches are numbered, the right ones first
+        expected = 1 - (1 - fraction) ** 7
         assert compute_sample_chance(np.array([right]), wrong, 7)[0] == pytest.approx(expected, abs=1e-12)
 
 
-def simulate_success(n: int, told: float, wrong: int, trials: int, agreeing: float, runs: int = 4000) -> float:
+def simulate_success(n: int, inclusion: float, wrong: int, trials: int, agreement: float, runs: int = 4000) -> float:
     """RANSAC on matches that are right or wrong, trial by trial."""
     rng = np.random.default_rng([n, wrong, trials])
     found = 0
     for _ in range(runs):
-        right = rng.binomial(n, told)
+        right = rng.binomial(n, inclusion)
         if right + wrong < SAMPLE:
             continue
         samples = np.array([rng.choice(right + wrong, SAMPLE, replace=False) for _ in range(trials)])
-        best_wrong = SAMPLE + rng.poisson(wrong * agreeing, trials).max()
+        best_wrong = SAMPLE + rng.poisson(wrong * agreement, trials).max()
         found += bool((samples < right).all(axis=1).any()) and right > best_wrong
     return found / runs
 
 
 @pytest.mark.parametrize(
-    ("n", "told", "wrong", "trials", "agreeing"), [(20, 0.3, 10, 8, 0.02), (12, 0.5, 3, 5, 0.1), (30, 0.2, 25, 20, 0.0)]
+    ("n", "inclusion", "wrong", "trials", "agreement"), [(20, 0.3, 10, 8, 0.02), (12, 0.5, 3, 5, 0.1), (30, 0.2, 25, 20, 0.0)]
 )
-def test_success_against_simulation(n: int, told: float, wrong: int, trials: int, agreeing: float) -> None:
+def test_success_against_simulation(n: int, inclusion: float, wrong: int, trials: int, agreement: float) -> None:
     runs = 1500
-    expected = success(n, told, wrong, trials, agreeing)
-    share = simulate_success(n, told, wrong, trials, agreeing, runs)
+    expected = estimate_success(n, inclusion, wrong, trials, agreement)
+    fraction = simulate_success(n, inclusion, wrong, trials, agreement, runs)
     assert 0.05 < expected < 0.95
-    assert stats.binomtest(round(share * runs), runs, expected).pvalue > 1e-3
+    assert stats.binomtest(round(fraction * runs), runs, expected).pvalue > 1e-3
 
 
 def test_control_half_of_the_model_fails() -> None:
-    n, told, wrong, trials, agreeing, runs = 20, 0.5, 30, 25, 0.1, 1500
-    hits = round(simulate_success(n, told, wrong, trials, agreeing, runs) * runs)
-    assert stats.binomtest(hits, runs, success(n, told, wrong, trials, agreeing)).pvalue > 1e-3
+    n, inclusion, wrong, trials, agreement, runs = 20, 0.5, 30, 25, 0.1, 1500
+    hits = round(simulate_success(n, inclusion, wrong, trials, agreement, runs) * runs)
+    assert stats.binomtest(hits, runs, estimate_success(n, inclusion, wrong, trials, agreement)).pvalue > 1e-3
     right = np.arange(n + 1)
-    for half in (compute_sample_chance(right, wrong, trials), compute_selection_chance(right, wrong, trials, agreeing)):
-        assert stats.binomtest(hits, runs, float(stats.binom.pmf(right, n, told) @ half)).pvalue < 1e-9
+    for half in (compute_sample_chance(right, wrong, trials), compute_selection_chance(right, wrong, trials, agreement)):
+        assert stats.binomtest(hits, runs, float(stats.binom.pmf(right, n, inclusion) @ half)).pvalue < 1e-9
 
 
-def test_told_words_are_those_of_the_mechanism() -> None:
+def test_inclusion_is_that_of_the_mechanism() -> None:
     rng = np.random.default_rng(0)
     true = rng.integers(500, size=50_000)
     for row in estimate_sizes(3.0, 500, [1, 3, 20], Workload()):
-        share = (draw_word_subsets(true, 500, 3.0, row.size, rng) == true[:, None]).any(axis=1).mean()
-        assert row.inclusion == pytest.approx(share, abs=0.01)
+        fraction = (draw_word_subsets(true, 500, 3.0, row.size, rng) == true[:, None]).any(axis=1).mean()
+        assert row.inclusion == pytest.approx(fraction, abs=0.01)
 
 
-def test_criteria_part() -> None:
-    """At the scaled size of the paper, one criterion asks for few words, the other for many."""
+def test_criteria_disagree() -> None:
+    """At the scaled size of the paper, one criterion selects few words, the other many."""
     rows = estimate_sizes(6.534, 8000, [1, 2, 4, 8, 16, 65], Workload())
     assert max(rows, key=lambda row: row.bits).size == 65
     assert max(rows, key=lambda row: row.success).size <= 2
-    # With few keypoints, one word each leaves too few right matches to be told from chance.
+    # With few keypoints, one word each gives too few right matches to stand out from chance.
     few = estimate_sizes(6.534, 8000, [1, 2, 4, 8, 16], Workload(keypoints=150))
     assert max(few, key=lambda row: row.success).size > 2
     several = estimate_sizes(6.534, 8000, [2], Workload(repeatability=[0.1, 0.5]))[0]
-    each = [estimate_sizes(6.534, 8000, [2], Workload(repeatability=[share]))[0].success for share in (0.1, 0.5)]
+    each = [estimate_sizes(6.534, 8000, [2], Workload(repeatability=[fraction]))[0].success for fraction in (0.1, 0.5)]
     assert several.success == pytest.approx(np.mean(each))
 
 
@@ -130,7 +130,7 @@ def test_criteria_part() -> None:
 def test_mistakes(given: Any, complaint: str) -> None:
     with pytest.raises(UserError, match=complaint):
         estimate_sizes(*given, Workload())
-    with pytest.raises(UserError, match="shares are from 0 to 1"):
+    with pytest.raises(UserError, match="must be from 0 to 1"):
         estimate_sizes(1.0, 10, [1], Workload(repeatability=[2.0]))
 
 
@@ -145,7 +145,7 @@ def record(size: int, epsilon: float | str, **changed: Any) -> dict[str, Any]:
     } | changed
 
 
-def test_what_was_measured() -> None:
+def test_collected_recalls() -> None:
     records = [record(1, 2.0), record(2, 2.0004), record(2, 2.0), record(1, "inf"), record(2, "inf"), record(4, 3.0)]
     records += [record(2, 2.0, condition="night"), record(2, 2.0, status="failed"), record(2, 2.0, task_settings={"trials": 5})]
     assert collect_recalls(records, 2.0, 100, 30_000, "day") == ({1: [0.0], 2: [1.0, 1.0]}, [0.25])
@@ -154,7 +154,7 @@ def test_what_was_measured() -> None:
 
 
 def run(capfd: pytest.CaptureFixture[str], *arguments: Any) -> tuple[int, str, str]:
-    status = cli.main(["choose", *map(str, arguments)])
+    status = cli.main(["subset-size", *map(str, arguments)])
     return status, *capfd.readouterr()
 
 
@@ -162,8 +162,8 @@ def test_the_command(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     status, shown, _ = run(capfd, "--epsilon", "6.534", "--words", 8000)
     assert status == 0
     assert [line.split()[1] for line in shown.splitlines() if line.startswith("│")] == ["1", "2", "4", "8", "12", "16", "65"]
-    assert "tells most of its word: m = 65" in shown
-    assert "how frequent words are: m = 12" in shown
+    assert "most information about its word: m = 65" in " ".join(shown.split())
+    assert "most accurate word frequencies: m = 12" in " ".join(shown.split())
     from record_lines import record as whole
 
     lines = [whole(**record(size, 2.0), run_hash=f"{size}") for size in (1, 2)] + [whole(**record(1, "inf"), run_hash="i")]
@@ -172,5 +172,5 @@ def test_the_command(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     assert status == 0
     assert "1.000 of 1" in shown
     assert shown.count("n/a") == 1
-    assert run(capfd)[2] == "bench: --epsilon is missing (bench choose --help explains)\n"
+    assert run(capfd)[2] == "bench: --epsilon is missing (see bench subset-size --help)\n"
     assert run(capfd, "--epsilon", "x")[0] == 2

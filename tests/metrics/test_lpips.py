@@ -1,4 +1,4 @@
-"""LPIPS of weights that are made up here, against its formula; and how it is asked for."""
+"""LPIPS with random weights against its formula, and the option `--metric`."""
 
 from pathlib import Path
 from typing import Any
@@ -6,14 +6,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from fake_plugins.painter import Painter
-from fakes import FAKES, write_album, install_plugins
+from fake_plugins.sketch import Sketch
+from fakes import FAKES, install_plugins, write_album
 
 from bench import cli, testing
 from bench.core.errors import UserError
 from bench.registry import discovery, spec
-from bench.runner import execute
-from bench.runner.plan import build_plan
+from bench.runner.plan import RunConfiguration, build_plan
 from defenses.none import Undefended
 
 pytest.importorskip("lpips", reason="the library is not installed (pip install -e '.[lpips]')")
@@ -27,7 +26,7 @@ SHIFT, SCALE = np.array([-0.030, -0.088, -0.188]), np.array([0.458, 0.448, 0.450
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """AlexNet's, drawn at random: what they were trained for has no part in the formula."""
+    """Random AlexNet weights: the formula does not depend on training."""
     torch.manual_seed(0)
     path = tmp_path_factory.mktemp("weights") / "alexnet.pth"
     torch.save(torchvision.models.alexnet(weights=None).state_dict(), path)
@@ -42,7 +41,7 @@ def images() -> tuple[np.ndarray, np.ndarray]:
 
 
 def by_definition(weights: Path, truth: np.ndarray, estimate: np.ndarray) -> float:
-    """Eq. (1) of the paper: unit-norm features, their squared differences weighed by channel, averaged over places, summed."""
+    """Eq. (1) of the paper: unit-norm features, their squared differences weighed by channel, averaged over positions, summed."""
     import lpips
 
     network = torchvision.models.alexnet(weights=None).eval()
@@ -52,9 +51,9 @@ def by_definition(weights: Path, truth: np.ndarray, estimate: np.ndarray) -> flo
     for image in (truth, estimate):
         x = torch.from_numpy((((image * 2.0 - 1.0) - SHIFT) / SCALE).astype(np.float32)).permute(2, 0, 1)[None]
         found = []
-        for place, layer in enumerate(network.features):
+        for index, layer in enumerate(network.features):
             x = layer(x)
-            if place in RELUS:
+            if index in RELUS:
                 features = x[0].detach().numpy().astype(np.float64).copy()  # (C, h, w)
                 found.append(features / (np.linalg.norm(features, axis=0) + 1e-10))
         layers.append(found)
@@ -65,13 +64,13 @@ def by_definition(weights: Path, truth: np.ndarray, estimate: np.ndarray) -> flo
     return total
 
 
-def test_it_is_what_the_paper_says(weights: Path, images: tuple[np.ndarray, np.ndarray]) -> None:
+def test_formula_of_the_paper(weights: Path, images: tuple[np.ndarray, np.ndarray]) -> None:
     found = LPIPS(weights=weights)(*images)
     assert found == pytest.approx(by_definition(weights, *images), rel=1e-4)
     assert found > 0
 
 
-def test_it_keeps_the_contract_of_metrics(weights: Path) -> None:
+def test_contract_of_metrics(weights: Path) -> None:
     discovery.check(discovery.METRIC, LPIPS)
     testing.check_metric(LPIPS(weights=weights))
 
@@ -79,8 +78,8 @@ def test_it_keeps_the_contract_of_metrics(weights: Path) -> None:
 def test_its_settings_are_the_weights_by_content(weights: Path, tmp_path: Path) -> None:
     write_album(tmp_path / "album", 1)
     plan = build_plan(
-        runner.RunConfiguration(
-            pairs=((Undefended(), Painter()),),
+        RunConfiguration(
+            pairs=((Undefended(), Sketch()),),
             images=tmp_path / "album",
             task=spec.read("reconstruction", discovery.TASK),
             extractor=spec.read("sift", discovery.EXTRACTOR),
@@ -89,7 +88,7 @@ def test_its_settings_are_the_weights_by_content(weights: Path, tmp_path: Path) 
             metrics=(LPIPS(weights=weights),),
         )
     )
-    settings = plan.cells[0].head["metric_settings"]
+    settings = plan.experiments[0].metadata["metric_settings"]
     assert settings["lpips"]["weights"].startswith("sha256:")
     assert settings["lpips"]["network"] == "alex"
     assert "ssim" in settings
@@ -107,13 +106,13 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
         LPIPS(weights=wrong)
 
 
-def test_it_is_measured_where_it_is_asked_for(
+def test_it_is_measured_only_on_request(
     weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     install_plugins(tmp_path / "installed", monkeypatch, FAKES)
     write_album(tmp_path / "album", 1)
     monkeypatch.chdir(tmp_path)
-    command = ["run", "--defense", "none", "--attack", "painter", "--images", "album", "--json"]
+    command = ["run", "--defense", "none", "--attack", "sketch", "--images", "album", "--json"]
 
     def metrics(*more: str) -> dict[str, Any]:
         import json
@@ -124,7 +123,7 @@ def test_it_is_measured_where_it_is_asked_for(
     assert "lpips" not in metrics("--out", "a")
     assert metrics("--out", "b", "--metric", f"lpips:weights={weights}")["lpips"] > 0
     assert cli.main([*command, "--metric", "ssim", "--out", "c"]) == 2
-    assert "needs not be asked for" in capsys.readouterr().err
+    assert "not needed" in capsys.readouterr().err
     assert cli.main([*command, "--metric", "lpips", "--out", "c"]) == 2
     assert "lpips needs weights (a path)" in capsys.readouterr().err
     assert not Path("c").exists()

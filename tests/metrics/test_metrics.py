@@ -81,7 +81,7 @@ def test_ssim_equals_both_references(images: tuple[np.ndarray, np.ndarray]) -> N
         {"gaussian_weights": False},  # scikit-image's default, a uniform window
         {"use_sample_covariance": True},
         {"sigma": 1.0},
-        {"data_range": 2.0},  # what is assumed of floats where it is not given
+        {"data_range": 2.0},  # the default for floats
     ],
     ids=str,
 )
@@ -121,7 +121,7 @@ def test_control_arccos_of_the_dot_product_is_not_exact() -> None:
     assert math.degrees(math.acos(math.cos(theta))) != pytest.approx(1e-7, rel=1e-3)
 
 
-def test_angle_is_a_mean_and_knows_zero_rows() -> None:
+def test_angle_is_a_mean_and_handles_zero_rows() -> None:
     truth = np.array([[1, 0], [1, 0], [0, 1]], dtype=np.float32)
     estimate = np.array([[1, 0], [0, 1], [0, 0]], dtype=np.float32)
     assert angle.PLUGIN()(truth, estimate) == pytest.approx((0 + 90 + 90) / 3)
@@ -133,7 +133,7 @@ def test_l2_is_the_mean_of_distances() -> None:
     assert l2.PLUGIN()(truth, estimate) == pytest.approx((2 + math.sqrt(2) + 0) / 3, abs=1e-12)
 
 
-def test_recovered_counts_those_nearest_to_their_own() -> None:
+def test_recovered_counts_estimates_nearest_to_their_own() -> None:
     truth = np.eye(4, dtype=np.float32)
     estimate = normalize_rows(np.array([[0.6, 0.5, 0, 0], [0.6, 0.5, 0, 0], [0, 0, 1, 0], [0, 0, 0, -1]]))
     # 0 and 2 are nearest to their own; 1 is nearest to 0; 3 ties with cosine 0 between 0, 1 and 2.
@@ -147,22 +147,19 @@ def test_recovered_ties_go_to_the_lowest_index() -> None:
     assert recovered.PLUGIN()(truth, nothing) == pytest.approx(1 / 3)
 
 
-def test_recovered_takes_equal_descriptors_for_one_candidate() -> None:
+def test_recovered_counts_equal_descriptors_as_one_candidate() -> None:
     truth = np.eye(3, dtype=np.float32)[[0, 0, 1]]
     assert recovered.PLUGIN()(truth, truth) == 1.0
 
 
 def test_recovered_chance_level() -> None:
-    """Any one guess for all gives exactly 1 / N; independent guesses give it on average."""
+    """A constant guess gives exactly 1 / N; independent guesses give it on average."""
     rng = np.random.default_rng(0)
     truth = normalize_rows(rng.normal(size=(200, 16)))
     same = np.repeat(normalize_rows(rng.normal(size=(1, 16))), 200, axis=0)
     assert recovered.PLUGIN()(truth, same) == pytest.approx(1 / 200)
     hits = sum(round(200 * recovered.PLUGIN()(truth, normalize_rows(rng.normal(size=(200, 16))))) for _ in range(50))
     assert 20 <= hits <= 85  # 50 are expected; about Poisson, so within 5 deviations
-
-
-# ---- what all have in common
 
 
 # ---- faces
@@ -175,18 +172,18 @@ def portrait() -> np.ndarray:
     return (photographs.read(astronaut.path).pixels / 255).astype(np.float32)
 
 
-def test_a_face_is_found_again_only_where_it_was(portrait: np.ndarray) -> None:
-    found = face.PLUGIN()
-    assert found(portrait, portrait.copy()) == 1.0
+def test_a_face_counts_only_at_its_position(portrait: np.ndarray) -> None:
+    metric = face.PLUGIN()
+    assert metric(portrait, portrait.copy()) == 1.0
     darker = portrait * np.float32(0.8)
-    assert found(portrait, darker) == 1.0
+    assert metric(portrait, darker) == 1.0
     elsewhere = np.roll(portrait, 60, axis=1)
-    assert found(elsewhere, elsewhere.copy()) == 1.0  # it is a face there,
-    assert found(portrait, elsewhere) == 0.0  # but not the photograph's
-    assert found(portrait, np.full_like(portrait, 0.5)) == 0.0
+    assert metric(elsewhere, elsewhere.copy()) == 1.0  # it is a face there,
+    assert metric(portrait, elsewhere) == 0.0  # but not the photograph's
+    assert metric(portrait, np.full_like(portrait, 0.5)) == 0.0
 
 
-def test_a_photograph_without_a_face_has_no_share(portrait: np.ndarray) -> None:
+def test_a_photograph_without_a_face_has_no_value(portrait: np.ndarray) -> None:
     for source in photographs.list_ground_textures():
         ground = (photographs.read(source.path).pixels / 255).astype(np.float32)
         assert face.PLUGIN()(ground, portrait) is None
@@ -200,7 +197,7 @@ def test_of_two_faces_one_may_be_found(portrait: np.ndarray) -> None:
 
 
 def test_faces_are_those_of_scikit_image(portrait: np.ndarray) -> None:
-    """The detector's own answer, asked without the metric: a box around the astronaut's face, from the hair to the chin."""
+    """The detector's direct result: a box around the astronaut's face, from the hair to the chin."""
     from skimage.data import lbp_frontal_face_cascade_filename
     from skimage.feature import Cascade
 
@@ -215,7 +212,7 @@ def test_faces_are_those_of_scikit_image(portrait: np.ndarray) -> None:
     assert face.PLUGIN()(portrait, others) == 1.0
 
 
-def test_overlap_is_the_share_of_pixels_counted_one_by_one() -> None:
+def test_overlap_against_counted_pixels() -> None:
     rng = np.random.default_rng(4)
     one, other = (rng.integers((0, 0, 1, 1), (20, 20, 21, 21), (50, 4)) for _ in range(2))
 

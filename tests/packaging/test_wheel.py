@@ -9,13 +9,15 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.exhaustive
+
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("bench", "defenses", "attacks", "metrics", "leaderboard", "suites")
 
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory):
-    """Built from a copy, so that nothing left over from an earlier build gets in."""
+    """Build from a copy, without files of earlier builds."""
     source = tmp_path_factory.mktemp("source")
     for package in (*PACKAGES, "tests"):
         shutil.copytree(ROOT / package, source / package, ignore=shutil.ignore_patterns("__pycache__"))
@@ -28,7 +30,7 @@ def wheel(tmp_path_factory):
     return built
 
 
-def test_holds_the_packages_and_the_assets_and_no_tests(wheel):
+def test_contains_packages_and_assets_but_no_tests(wheel):
     with zipfile.ZipFile(wheel) as opened:
         names = opened.namelist()
     assert {name.split("/")[0] for name in names if ".dist-info" not in name} == set(PACKAGES)
@@ -47,7 +49,7 @@ def test_runs_from_a_new_environment(wheel, tmp_path):
     python = environment / "bin" / "python"
     subprocess.run([sys.executable, "-m", "pip", "--python", str(python), "install", "-q", "--no-deps", str(wheel)], check=True)
     (site,) = environment.glob("lib/python*/site-packages")
-    # The heavy dependencies are shared. A path in a .pth file is not searched for .pth files, so the editable install stays out.
+    # The dependencies are shared. Folders of a .pth file are not searched for .pth files, so the editable install is not found.
     (site / "shared.pth").write_text(sysconfig.get_path("purelib") + "\n")
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()

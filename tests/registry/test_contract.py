@@ -1,4 +1,4 @@
-"""One test of every registered plugin against what it claims."""
+"""Contract tests of every registered plugin, and controls that break the contract."""
 
 import dataclasses
 from pathlib import Path
@@ -24,31 +24,31 @@ from bench.types import Descriptors, Features, Points
 from defenses.ldp import LDP
 
 
-def plugins(kind: Kind) -> Any:
+def parametrize(kind: Kind) -> Any:
     return pytest.mark.parametrize("plugin", discovery.load_plugins(kind), ids=lambda plugin: plugin.name())
 
 
-def built(plugin: type) -> Any:
+def build_plugin(plugin: type) -> Any:
     if fields.list_required(plugin):
-        pytest.skip("has a field that must be given, and a test of its own")
+        pytest.skip("has a required field, and a test of its own")
     return spec.build(plugin, {})
 
 
-@plugins(discovery.DEFENSE)
+@parametrize(discovery.DEFENSE)
 def test_defense(plugin: type[Defense], tmp_path: Path) -> None:
-    defense = built(plugin)
+    defense = build_plugin(plugin)
     small = write_dictionary(tmp_path)
     check_defense(dataclasses.replace(defense, **dict.fromkeys(fields.list_assets(defense), small)), Public(), draw_features())
 
 
-@plugins(discovery.METRIC)
+@parametrize(discovery.METRIC)
 def test_metric(plugin: type[Metric]) -> None:
-    check_metric(built(plugin))
+    check_metric(build_plugin(plugin))
 
 
-@plugins(discovery.EXTRACTOR)
+@parametrize(discovery.EXTRACTOR)
 def test_extractor(plugin: type[Extractor], tmp_path: Path) -> None:
-    check_extractor(built(plugin), photographs.crop_square(draw_texture(0), 256))
+    check_extractor(build_plugin(plugin), photographs.crop_square(draw_texture(0), 256))
 
 
 PAIRS = [
@@ -58,16 +58,17 @@ PAIRS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("attack", "defense"), PAIRS)
 def test_attack(attack: type[Attack], defense: type[Defense], tmp_path: Path) -> None:
-    attacker, defender = built(attack), built(defense)
+    attacker, defender = build_plugin(attack), build_plugin(defense)
     if "database" in fields.list_assets(attacker):
         attacker = dataclasses.replace(attacker, database=write_dictionary(tmp_path))
     if check_applicability(attacker, defender, Sift(), Public()):
         check_attack(attacker, defender, Sift(), draw_features(20))
 
 
-# ---- negative controls: each breaks one promise, and its check notices
+# ---- negative controls: each violates one rule, and its check fails
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -101,24 +102,24 @@ class Careless(Leaky):
 @pytest.mark.parametrize(
     ("defense", "complaint"), [(Leaky(), "shares memory"), (Shifted(), "keypoints"), (Careless(), "same rng")]
 )
-def test_wrong_defense_is_noticed(defense: Defense, complaint: str) -> None:
+def test_wrong_defense_is_detected(defense: Defense, complaint: str) -> None:
     with pytest.raises(AssertionError, match=complaint):
         check_defense(defense, Public(), draw_features())
 
 
-def test_an_extractor_that_keeps_the_order_of_responses_is_noticed() -> None:
+def test_extractor_with_keypoints_in_order_of_response_is_detected() -> None:
     class Ranked(Sift):
         def extract(self, image: np.ndarray, source: Path | None = None) -> Features:
-            found = super().extract(image, source)
+            features = super().extract(image, source)
             return dataclasses.replace(
-                found, keypoints=found.keypoints[::-1], descriptors=found.descriptors[::-1], codes=found.codes[::-1]
+                features, keypoints=features.keypoints[::-1], descriptors=features.descriptors[::-1], codes=features.codes[::-1]
             )
 
     with pytest.raises(AssertionError, match="order of keypoints"):
         check_extractor(Ranked(), photographs.crop_square(draw_texture(0), 256))
 
 
-def test_peeking_attack_is_noticed() -> None:
+def test_peeking_attack_is_detected() -> None:
     from fake_plugins.guess import Guess
 
     class Peeking(Guess):
@@ -132,21 +133,21 @@ def test_peeking_attack_is_noticed() -> None:
         check_attack(Peeking(), Leaky(), Sift(), draw_features())
 
 
-def test_attack_that_rummages_in_what_is_kept_on_disk_is_noticed(tmp_path: Path) -> None:
+def test_attack_that_reads_the_cache_is_detected(tmp_path: Path) -> None:
     from fake_plugins.guess import Guess
 
-    class Rummaging(Guess):
+    class CachedFeatures(Guess):
         def recover(self, view: View, rng: np.random.Generator) -> np.ndarray:
             (features,) = (entry.path for entry in store.list_entries() if entry.kind == "features")
             return unit_rows(tensor_file.load(features, "features")[0]["descriptors"] + np.float32(1e-3))
 
-    class Quantised(Guess):
+    class CachedWords(Guess):
         def recover(self, view: View, rng: np.random.Generator) -> np.ndarray:
             (words,) = (entry.path for entry in store.list_entries() if entry.kind == "words")
-            found = tensor_file.load(words, "words")[0]["words"]
-            return unit_rows(dictionary.load(Path(small)).words[found])
+            indices = tensor_file.load(words, "words")[0]["words"]
+            return unit_rows(dictionary.load(Path(small)).words[indices])
 
     small = write_dictionary(tmp_path)
-    for attack in (Rummaging(), Quantised()):
+    for attack in (CachedFeatures(), CachedWords()):
         with pytest.raises(AssertionError, match="saw more"):
             check_attack(attack, LDP(dictionary=small), Sift(), draw_features())

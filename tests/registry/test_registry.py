@@ -1,4 +1,4 @@
-"""Finding plugins, and refusing wrong ones."""
+"""Discovery of plugins, and errors of wrong ones."""
 
 import subprocess
 import sys
@@ -32,13 +32,13 @@ def test_modules_without_plugin_and_subpackages_are_skipped() -> None:
 
 def test_external_plugins_are_found_by_entry_point(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     install_plugins(tmp_path, monkeypatch, FAKES)
-    assert discovery.load_plugin(discovery.ATTACK, "painter").name() == "painter"
+    assert discovery.load_plugin(discovery.ATTACK, "sketch").name() == "sketch"
     assert discovery.load_plugin(discovery.DEFENSE, "broken").summary() == "Fails at every photograph."
 
 
-def test_two_plugins_of_one_name_are_refused_with_both_origins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    install_plugins(tmp_path, monkeypatch, {"feature_privacy.defenses": {"ldp": "fake_plugins.broken:PLUGIN"}}, name="stranger")
-    with pytest.raises(UserError, match=r"two defense plugins are called 'ldp': defenses\.ldp and fake_plugins.*stranger"):
+def test_duplicate_names_are_an_error_with_both_origins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    install_plugins(tmp_path, monkeypatch, {"feature_privacy.defenses": {"ldp": "fake_plugins.broken:PLUGIN"}}, name="external")
+    with pytest.raises(UserError, match=r"two defense plugins are called 'ldp': defenses\.ldp and fake_plugins.*external"):
         discovery.load_plugin(discovery.DEFENSE, "none")
 
 
@@ -49,9 +49,9 @@ def test_entry_point_must_have_the_name_of_the_file(tmp_path: Path, monkeypatch:
 
 
 def test_plugin_that_cannot_be_imported_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    install_plugins(tmp_path, monkeypatch, {"feature_privacy.defenses": {"absent": "no_such_module:PLUGIN"}}, name="stranger")
+    install_plugins(tmp_path, monkeypatch, {"feature_privacy.defenses": {"absent": "no_such_module:PLUGIN"}}, name="external")
     assert discovery.load_plugin(discovery.DEFENSE, "none")  # the others are not affected
-    with pytest.raises(UserError, match=r"no_such_module.*stranger.*cannot be imported"):
+    with pytest.raises(UserError, match=r"no_such_module.*external.*cannot be imported"):
         discovery.load_plugin(discovery.DEFENSE, "absent")
 
 
@@ -60,8 +60,8 @@ def test_misspelt_name_gets_a_hint_and_the_list() -> None:
         discovery.load_plugin(discovery.DEFENSE, "lpd")
 
 
-def frozen(base: type, **body: Any) -> type:
-    """A frozen keyword-only dataclass with this body."""
+def build_class(base: type, **body: Any) -> type:
+    """Return a frozen keyword-only dataclass with this body."""
     return dataclass(frozen=True, kw_only=True)(type("Wrong", (base,), {"__module__": __name__, **body}))
 
 
@@ -73,15 +73,15 @@ def privacy(self: Any, public: Public) -> Privacy:
     return Privacy("none")
 
 
-def swapped(self: Any, secret: Features, rng: np.random.Generator, public: Public) -> Release:
+def protect_with_swapped_arguments(self: Any, secret: Features, rng: np.random.Generator, public: Public) -> Release:
     raise NotImplementedError
 
 
 GOOD = {"releases": Descriptors, "protect": protect, "privacy": privacy}
 
 
-def test_right_plugin_is_accepted() -> None:
-    discovery.check(discovery.DEFENSE, frozen(Defense, __annotations__={"strength": float}, strength=1.0, **GOOD))
+def test_valid_plugin_is_accepted() -> None:
+    discovery.check(discovery.DEFENSE, build_class(Defense, __annotations__={"strength": float}, strength=1.0, **GOOD))
 
 
 @pytest.mark.parametrize(
@@ -91,35 +91,40 @@ def test_right_plugin_is_accepted() -> None:
         (dataclass(type("Thawed", (Defense,), {"__module__": __name__, **GOOD})), r"@dataclass\(frozen=True, kw_only=True\)"),
         (dataclass(frozen=True)(type("Positional", (Defense,), {"__annotations__": {"a": int}, "a": 1, **GOOD})), "kw_only"),
         (3, "must be a subclass of Defense"),
-        (frozen(Metric), "must be a subclass of Defense"),
-        (frozen(Defense, releases=Descriptors, protect=protect), r"lacks privacy\(self, public: Public\) -> Privacy"),
-        (frozen(Defense, strength=1.0, **GOOD), r"`strength = 1.0` is a field without a type: write `strength: float = 1.0`"),
-        (frozen(Defense, __annotations__={"sizes": list}, **GOOD), "field `sizes` has type"),
+        (build_class(Metric), "must be a subclass of Defense"),
+        (build_class(Defense, releases=Descriptors, protect=protect), r"lacks privacy\(self, public: Public\) -> Privacy"),
         (
-            frozen(Defense, releases=Descriptors, protect=swapped, privacy=privacy),
+            build_class(Defense, strength=1.0, **GOOD),
+            r"`strength = 1.0` is a field without a type: write `strength: float = 1.0`",
+        ),
+        (build_class(Defense, __annotations__={"sizes": list}, **GOOD), "field `sizes` has type"),
+        (
+            build_class(Defense, releases=Descriptors, protect=protect_with_swapped_arguments, privacy=privacy),
             r"wrong signature; it should be protect\(self, secret: Features, public: Public, rng: np.random.Generator\)",
         ),
-        (frozen(Defense, protect=protect, privacy=privacy), r"lacks the class variable `releases: type\[Release\]`"),
+        (build_class(Defense, protect=protect, privacy=privacy), r"lacks the class variable `releases: type\[Release\]`"),
     ],
 )
-def test_wrong_defense_is_refused_with_what_is_right(plugin: Any, complaint: str) -> None:
+def test_error_of_wrong_defense_states_the_rule(plugin: Any, complaint: str) -> None:
     with pytest.raises(UserError, match=complaint):
         discovery.check(discovery.DEFENSE, plugin)
 
 
-def test_attack_must_say_what_it_recovers() -> None:
+def test_attack_must_subclass_one_of_three_classes() -> None:
     with pytest.raises(UserError, match="DescriptorAttack or SelectiveAttack or ImageAttack"):
-        discovery.check(discovery.ATTACK, frozen(Attack, accepts=(Descriptors,)))
+        discovery.check(discovery.ATTACK, build_class(Attack, accepts=(Descriptors,)))
 
 
-def test_attack_must_not_decide_applicability_itself() -> None:
+def test_attack_must_not_override_applicability() -> None:
     from bench.api import ImageAttack
 
-    def inapplicable(self: Any, defense: Any, extractor: Any, public: Any) -> None: ...
+    def explain_not_applicable(self: Any, defense: Any, extractor: Any, public: Any) -> None: ...
     def reconstruct(self: Any, view: Any, rng: Any) -> None: ...
 
-    wrong = frozen(ImageAttack, accepts=(Descriptors,), reconstruct=reconstruct, explain_not_applicable=inapplicable)
-    with pytest.raises(UserError, match="must not override inapplicable"):
+    wrong = build_class(
+        ImageAttack, accepts=(Descriptors,), reconstruct=reconstruct, explain_not_applicable=explain_not_applicable
+    )
+    with pytest.raises(UserError, match="must not override explain_not_applicable"):
         discovery.check(discovery.ATTACK, wrong)
 
 
@@ -131,7 +136,7 @@ def test_attack_must_not_decide_applicability_itself() -> None:
         "from bench.cli import main\ntry: main(['--help'])\nexcept SystemExit: pass",
     ],
 )
-def test_heavy_libraries_are_not_imported_before_they_are_needed(code: str) -> None:
+def test_heavy_libraries_are_not_imported_early(code: str) -> None:
     heavy = "{'torch', 'cv2', 'pandas', 'matplotlib', 'skimage', 'h5py'}"
-    script = f"import sys\n{code}\nfound = {heavy} & set(sys.modules)\nassert not found, found"
+    script = f"import sys\n{code}\nimported = {heavy} & set(sys.modules)\nassert not imported, imported"
     subprocess.run([sys.executable, "-c", script], check=True, capture_output=True)

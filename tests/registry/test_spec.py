@@ -1,4 +1,4 @@
-"""Plugins written as text, and their configuration."""
+"""Plugins as text, and as the JSON of records."""
 
 import math
 from pathlib import Path
@@ -15,7 +15,7 @@ from defenses.affine import Affine
 from defenses.ldp import LDP
 
 
-def test_fields_are_read_by_their_types() -> None:
+def test_fields_are_parsed_by_type() -> None:
     plugin, given = spec.parse("ldp:epsilon=12,subset_size=4", discovery.DEFENSE)
     assert plugin is LDP
     assert given == {"epsilon": 12.0, "subset_size": 4}
@@ -24,12 +24,12 @@ def test_fields_are_read_by_their_types() -> None:
 
 
 @pytest.mark.parametrize("text", ["ldp", "ldp:", " ldp : "])
-def test_no_fields_means_defaults(text: str) -> None:
+def test_no_fields_give_defaults(text: str) -> None:
     assert spec.parse(text.strip(), discovery.DEFENSE)[0] is LDP
     assert spec.read("ldp", discovery.DEFENSE) == LDP()
 
 
-def test_infinity_truth_choices_and_paths() -> None:
+def test_infinity_booleans_choices_and_paths() -> None:
     assert spec.read("ldp:epsilon=inf,subset_size=1", discovery.DEFENSE) == LDP(epsilon=math.inf, subset_size=1)
     assert spec.read("sift:upright=false", discovery.EXTRACTOR) == Sift(upright=False)
     assert spec.read("affine:lifting=random", discovery.DEFENSE) == Affine(lifting="random")
@@ -59,22 +59,22 @@ def test_infinity_truth_choices_and_paths() -> None:
         ("", "unknown defense ''"),
     ],
 )
-def test_mistakes_are_explained(text: str, complaint: str) -> None:
+def test_errors(text: str, complaint: str) -> None:
     with pytest.raises(UserError, match=complaint):
         spec.read(text, discovery.DEFENSE)
 
 
-def test_truth_is_true_or_false() -> None:
+def test_boolean_is_true_or_false() -> None:
     with pytest.raises(UserError, match="upright must be true or false, not '1'"):
         spec.read("sift:upright=1", discovery.EXTRACTOR)
 
 
-def test_field_without_default_must_be_given() -> None:
+def test_required_field() -> None:
     with pytest.raises(UserError, match=r"hloc needs path \(a path\): write hloc:path="):
         spec.read("hloc", discovery.EXTRACTOR)
 
 
-def test_configuration_holds_the_content_of_files(tmp_path: Path) -> None:
+def test_json_has_the_digest_of_files(tmp_path: Path) -> None:
     public, small = Public(), write_dictionary(tmp_path)
     assert spec.to_json_with_digests(LDP(epsilon=10, dictionary=small), public) == {
         "name": "ldp",
@@ -90,20 +90,20 @@ def test_configuration_holds_the_content_of_files(tmp_path: Path) -> None:
     )
 
 
-def test_configuration_knows_no_infinity_and_one_way_of_writing_a_number(tmp_path: Path) -> None:
+def test_json_has_no_infinity_and_one_form_of_a_number(tmp_path: Path) -> None:
     small = write_dictionary(tmp_path)
     assert spec.to_json_with_digests(LDP(epsilon=math.inf, dictionary=small), Public())["epsilon"] == "inf"
     assert repr(spec.to_json(LDP(epsilon=10))["epsilon"]) == "10.0"
 
 
-@pytest.mark.parametrize(("text", "written"), [("21/2", 10.5), ("0.1", 0.1), ("1/3", "1/3"), ("10", 10.0), ("inf", "inf")])
-def test_a_fraction_is_kept(text: str, written: float | str) -> None:
-    """And written so that two configurations which differ are two in the records, too."""
-    assert spec.to_json(spec.read(f"ldp:epsilon={text}", discovery.DEFENSE))["epsilon"] == written
+@pytest.mark.parametrize(("text", "value"), [("21/2", 10.5), ("0.1", 0.1), ("1/3", "1/3"), ("10", 10.0), ("inf", "inf")])
+def test_fraction_is_exact(text: str, value: float | str) -> None:
+    """Different configurations are different in records."""
+    assert spec.to_json(spec.read(f"ldp:epsilon={text}", discovery.DEFENSE))["epsilon"] == value
     assert spec.to_json(spec.read("ldp:epsilon=0.3333333333333333", discovery.DEFENSE))["epsilon"] != "1/3"
 
 
-def test_what_is_resolved_elsewhere_stands_in_the_place_of_an_asset() -> None:
+def test_resolved_values_override_fields() -> None:
     from attacks.nearest import Nearest
 
     assert spec.to_json_with_digests(Nearest(), Public(), {"database": "sha256:00", "inversion": None}) == {

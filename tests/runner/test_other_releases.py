@@ -34,6 +34,7 @@ def similarity(release, source: Source) -> float:
     return float((unit_rows(release.descriptors) @ np.concatenate(seen).T).max(axis=1).mean())
 
 
+@pytest.mark.slow
 def test_the_list_goes_on_and_is_the_same_each_time(sources) -> None:
     first = list(population(sources).without("0.png")(7))
     assert len(first) == 7
@@ -43,6 +44,7 @@ def test_the_list_goes_on_and_is_the_same_each_time(sources) -> None:
     assert not np.array_equal(first[0].keypoints, first[2].keypoints)  # another window of the same photograph
 
 
+@pytest.mark.slow
 def test_it_leaves_out_the_attacked_photograph(sources) -> None:
     releases = list(population(sources).without("0.png")(6))
     to_the_attacked = np.mean([similarity(release, sources[0]) for release in releases])

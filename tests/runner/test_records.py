@@ -76,12 +76,12 @@ def test_other_corrupt_lines_are_named(tmp_path: Path, line: bytes) -> None:
 def test_every_flipped_bit_is_found(tmp_path: Path) -> None:
     path = write(tmp_path / "r", record("a", metrics={"ssim": 0.58, "psnr": None}))
     whole = path.read_bytes()
-    for place in range(len(whole) - 1):  # the last byte ends the line
+    for position in range(len(whole) - 1):  # the last byte ends the line
         for bit in range(8):
             flipped = bytearray(whole)
-            flipped[place] ^= 1 << bit
+            flipped[position] ^= 1 << bit
             path.write_bytes(flipped)
-            if flipped[place] == ord("\n"):
+            if flipped[position] == ord("\n"):
                 continue  # two lines, and neither is JSON
             with pytest.raises(UserError, match="line"):
                 read(path)
@@ -151,7 +151,7 @@ def test_dataframe_of_nothing(tmp_path: Path) -> None:
     assert bench.load_records(write(tmp_path / "records.jsonl")).empty
 
 
-def test_reader_is_told_of_a_lost_line(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_lost_line_is_reported(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     path = write(tmp_path / "records.jsonl", record("a"))
     path.write_bytes(path.read_bytes() + b'{"sch')
     with caplog.at_level(logging.WARNING):

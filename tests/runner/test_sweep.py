@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from fake_plugins.fatal import Fatal
 from fake_plugins.guess import Guess
-from fake_plugins.painter import Painter
+from fake_plugins.sketch import Sketch
 from fakes import FAKES, check_plan, install_plugins, prepare_plan, write_album
 
 from attacks.dia import DIA
@@ -33,14 +33,14 @@ from defenses.affine import Affine
 from defenses.ldp import LDP
 from defenses.none import Undefended
 
-RECONSTRUCTION = Reconstruction(inverter="painter")
+RECONSTRUCTION = Reconstruction(inverter="sketch")
 MINE = """
-from fake_plugins.painter import Painter
+from fake_plugins.sketch import Sketch
 from bench.runner.suite import Suite, grid
 from bench.tasks.reconstruction import Reconstruction
 from defenses.none import Undefended
 
-PARTS = dict(defenses=[Undefended()], attacks=[Painter()], tasks=[Reconstruction(inverter="painter")])
+PARTS = dict(defenses=[Undefended()], attacks=[Sketch()], tasks=[Reconstruction(inverter="sketch")])
 SUITE = Suite(summary="mine", parts=grid(**PARTS, images="album", seeds=(0, 1)))
 TWICE = Suite(summary="the same experiments in two parts", parts=(*SUITE.parts, *SUITE.parts))
 """
@@ -85,7 +85,7 @@ def read_records(out: Path) -> list[Record]:
 def select_engine_independent(records: list[Record]) -> list[Any]:
     """Return the records without the keys that depend on the engine."""
     return [
-        {key: value for key, value in record.items() if key not in ("seconds", "environment", "run_hash")} for record in records
+        {key: value for key, value in record.items() if key not in ("seconds", "environment", "run_hash", "digest")} for record in records
     ]
 
 
@@ -98,7 +98,7 @@ def read_reconstructions(out: Path) -> dict[Path, bytes]:
 
 def test_grid_is_the_full_product() -> None:
     parts = grid(
-        defenses=[Undefended(), Affine()], attacks=[Painter(), Guess()], tasks=[RECONSTRUCTION, Reconstruction()], seeds=(0, 1, 2)
+        defenses=[Undefended(), Affine()], attacks=[Sketch(), Guess()], tasks=[RECONSTRUCTION, Reconstruction()], seeds=(0, 1, 2)
     )
     assert len(parts) == 6
     assert [part.seed for part in parts] == [0, 1, 2] * 2
@@ -107,6 +107,7 @@ def test_grid_is_the_full_product() -> None:
         grid(defenses=[Undefended()])
 
 
+@pytest.mark.slow
 def test_every_shipped_suite_can_be_planned() -> None:
     """The full suite contains all others."""
     suites = {name: suite.find(name) for name in suite.list_suites()}
@@ -116,6 +117,7 @@ def test_every_shipped_suite_can_be_planned() -> None:
     assert len(build_plan(suites["smoke"].parts[0])) == 9
 
 
+@pytest.mark.slow
 def test_privacy_and_utility_use_the_same_queries_and_defenses() -> None:
     few = Gallery(views=2, queries=1, night=0.0, width=64, height=48, detail=0.1)
     attacked, localized = (
@@ -150,6 +152,7 @@ def test_missing_suites(mine: str, name: str, complaint: str) -> None:
         suite.find(name)
 
 
+@pytest.mark.slow
 def test_sweep_of_a_user_suite_twice(mine: str, capfd: pytest.CaptureFixture[str]) -> None:
     exit_code, output, messages = bench(capfd, "sweep", mine)
     assert exit_code == 0
@@ -182,6 +185,7 @@ def test_engines_require_their_options() -> None:
             engines.choose_engine(*arguments)
 
 
+@pytest.mark.slow
 def test_processes_share_the_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     """Child processes are limited, for each numerical library."""
     for variable in threads.VARIABLES:
@@ -196,10 +200,11 @@ def test_processes_share_the_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     threads.limit_threads.cache_clear()
 
 
+@pytest.mark.slow
 def test_a_killed_process_stops_the_run_and_the_next_run_resumes(images: Path, tmp_path: Path) -> None:
     engine = engines.choose_engine(2)
     marker = tmp_path / "killed"
-    plan = prepare_plan([Undefended()], [Painter(), Fatal(marker=str(marker))], images, task=RECONSTRUCTION)
+    plan = prepare_plan([Undefended()], [Sketch(), Fatal(marker=str(marker))], images, task=RECONSTRUCTION)
     with pytest.raises(UserError, match=r"ended from outside.*run again to go on"):
         list(execute.execute([plan], tmp_path / "out", engine))
     assert marker.exists()
@@ -219,11 +224,12 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
         yield local_cluster
 
 
+@pytest.mark.slow
 def test_two_workers_one_of_them_killed(images: Path, small: Asset, tmp_path: Path, cluster: Any) -> None:
     """No record is lost or duplicated, and records and reconstructions equal those of one process."""
     (images / "bad.jpg").write_bytes(b"no photograph")
     marker = tmp_path / "killed"
-    attacks = [Painter(), Guess(), Fatal(marker=str(marker))]
+    attacks = [Sketch(), Guess(), Fatal(marker=str(marker))]
     parts = grid(
         defenses=[LDP(epsilon=8, dictionary=small), Undefended()], attacks=attacks, tasks=[RECONSTRUCTION], images=images
     )
@@ -248,17 +254,17 @@ def test_two_workers_one_of_them_killed(images: Path, small: Asset, tmp_path: Pa
 
 def test_an_attack_that_kills_every_worker_is_a_failed_record(images: Path, tmp_path: Path, cluster: Any) -> None:
     engine = engines.choose_engine(kind="dask", scheduler=cluster.scheduler_address)
-    part = grid(defenses=[Undefended()], attacks=[Fatal(), Painter()], tasks=[RECONSTRUCTION], images=[images / "0.png"])[0]
+    part = grid(defenses=[Undefended()], attacks=[Fatal(), Sketch()], tasks=[RECONSTRUCTION], images=[images / "0.png"])[0]
     plan = check_plan(build_plan(part, engine.describe))
-    fatal, painter = execute.sort_records([plan], execute.execute([plan], tmp_path / "out", engine))
-    assert (fatal["status"], painter["status"]) == ("failed", "ok")
+    fatal, sketch = execute.sort_records([plan], execute.execute([plan], tmp_path / "out", engine))
+    assert (fatal["status"], sketch["status"]) == ("failed", "ok")
     assert "every worker that began this ended" in fatal["reason"]
 
 
 def test_a_worker_with_other_files_is_refused(images: Path, tmp_path: Path, cluster: Any) -> None:
     """It would make other records."""
     engine = engines.choose_engine(kind="dask", scheduler=cluster.scheduler_address)
-    part = grid(defenses=[Undefended()], attacks=[Painter()], tasks=[RECONSTRUCTION], images=images)[0]
+    part = grid(defenses=[Undefended()], attacks=[Sketch()], tasks=[RECONSTRUCTION], images=images)[0]
     plan = check_plan(build_plan(part, engine.describe))
     write_album(images, 4)
     with pytest.raises(UserError, match="other source, libraries or files"):
@@ -279,7 +285,7 @@ def test_missing_scheduler(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def plan(images: Path) -> Plan:
-    return prepare_plan([Undefended(), Affine(lifting="random")], [Painter(), Guess()], images, task=RECONSTRUCTION)
+    return prepare_plan([Undefended(), Affine(lifting="random")], [Sketch(), Guess()], images, task=RECONSTRUCTION)
 
 
 def test_status_from_start_to_end(plan: Plan, tmp_path: Path) -> None:
@@ -308,7 +314,7 @@ def test_samples_in_progress_are_running_until_their_process_is_killed(plan: Pla
     code = """
 import sys, time
 from pathlib import Path
-from fake_plugins.painter import Painter
+from fake_plugins.sketch import Sketch
 from bench import runner
 from bench.tasks.reconstruction import Reconstruction
 from defenses.none import Undefended
@@ -317,8 +323,8 @@ def forever(self, view, rng):
     print("begun", flush=True)
     time.sleep(1000)
 
-Painter.reconstruct = forever
-plan = prepare_plan([Undefended()], [Painter()], "album", task=Reconstruction(inverter="painter"))
+Sketch.reconstruct = forever
+plan = prepare_plan([Undefended()], [Sketch()], "album", task=Reconstruction(inverter="sketch"))
 list(execute.execute([plan], Path("out")))
 """
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
@@ -347,24 +353,24 @@ def test_failed_samples_and_records_of_other_runs_are_counted_separately(
         "--defense",
         "none",
         "--attack",
-        "painter",
+        "sketch",
         "--images",
         images,
         "--out",
         out,
         "--task",
-        "reconstruction:inverter=painter",
+        "reconstruction:inverter=sketch",
     )
     assert bench(capfd, "run", *common)[0] == 1
     assert bench(capfd, "run", *common, "--seed", 1)[0] == 1
     result = bench(capfd, "status", "--results", out)
     assert result[0] == 0
     assert "3 done, 0 running, 1 failed, 0 missing; 4 records of other runs" in result[1]
-    assert "painter" in result[1]
+    assert "sketch" in result[1]
     overview = bench(capfd, "status")[1]
     assert "x" in overview
     assert "3 done" in overview
-    assert bench(capfd, "status", "x")[1].count("painter") == 1  # as a suite's name
+    assert bench(capfd, "status", "x")[1].count("sketch") == 1  # as a suite's name
     assert bench(capfd, "status", "absent")[0] == 2
     assert bench(capfd, "status", "x", "--results", out)[0] == 2
 
@@ -395,7 +401,7 @@ def test_a_full_disk_loses_no_written_record(
 
 def test_interrupted_sweep_resumes(mine: str, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
     calls: list[int] = []
-    reconstruct: Callable[..., Any] = Painter.reconstruct
+    reconstruct: Callable[..., Any] = Sketch.reconstruct
 
     def interrupted(self: Any, view: Any, rng: Any) -> Any:
         calls.append(1)
@@ -403,7 +409,7 @@ def test_interrupted_sweep_resumes(mine: str, monkeypatch: pytest.MonkeyPatch, c
             raise KeyboardInterrupt
         return reconstruct(self, view, rng)
 
-    monkeypatch.setattr(Painter, "reconstruct", interrupted)
+    monkeypatch.setattr(Sketch, "reconstruct", interrupted)
     exit_code, _, messages = bench(capfd, "sweep", mine)
     assert exit_code == 130
     assert "run the same command again to go on" in messages

@@ -1,4 +1,4 @@
-"""What a subspace meets of the database: the measure against brute force, and data for which it must succeed or fail."""
+"""Words near a subspace: the measure against brute force, and data for which it must succeed or fail."""
 
 from pathlib import Path
 
@@ -16,8 +16,8 @@ from defenses.affine import Affine
 from defenses.ldp import LDP
 
 
-def brute_force(defense: Affine, count: int, ratio: float, seed: int) -> dict[str, float]:
-    """The measure by its definition: every word's distance to every subspace, one at a time, in float64."""
+def measure_by_brute_force(defense: Affine, count: int, ratio: float, seed: int) -> dict[str, float]:
+    """Measure by the definition: every word's distance to every subspace, one at a time, in float64."""
     public, secret, rng = Public(), draw_features(12), np.random.default_rng(seed)
     words = unit_rows(public.dictionary(defense.database).words).astype(np.float64)
     found: dict[str, list[bool]] = {f"{name}_top{top}": [] for name in ("success", "with_adversarial") for top in COUNTS}
@@ -25,17 +25,17 @@ def brute_force(defense: Affine, count: int, ratio: float, seed: int) -> dict[st
         lifted = defense.lift(part, public, rng)
         for row in range(len(part)):
             basis, origin = lifted.release.bases[row].astype(np.float64), lifted.release.origins[row].astype(np.float64)
-            away = [np.linalg.norm((word - origin) - basis.T @ np.linalg.lstsq(basis.T, word - origin)[0]) for word in words]
+            distances = [np.linalg.norm((word - origin) - basis.T @ np.linalg.lstsq(basis.T, word - origin)[0]) for word in words]
             points = [part.descriptors[row].astype(np.float64), *words[lifted.words[row]]]
 
             def succeeds(word: int, points: list[np.ndarray] = points) -> bool:
                 nearest, second = sorted(float(np.linalg.norm(words[word] - point)) for point in points)[:2]
                 return nearest < ratio * second
 
-            order = np.argsort(away, kind="stable")
-            strangers = [word for word in order if word not in lifted.words[row]]
+            order = np.argsort(distances, kind="stable")
+            other_words = [word for word in order if word not in lifted.words[row]]
             for top in COUNTS:
-                found[f"success_top{top}"] += [succeeds(word) for word in strangers[:top]]
+                found[f"success_top{top}"] += [succeeds(word) for word in other_words[:top]]
                 found[f"with_adversarial_top{top}"] += [succeeds(word) for word in order[:top]]
     return {name: float(np.mean(values)) for name, values in found.items()}
 
@@ -45,14 +45,14 @@ def test_measure_is_that_of_brute_force(tmp_path: Path, dim: int, count: int) ->
     defense = Affine(dim=dim, database=write_dictionary(tmp_path, 160))
     task = Intersections(subspaces=count, ratio=0.95)
     metrics = task.evaluate(build_trial(defense, draw_features(12), rng=np.random.default_rng(5))).metrics
-    expected = brute_force(defense, count, 0.95, 5)
+    expected = measure_by_brute_force(defense, count, 0.95, 5)
     assert {name: metrics[name] for name in expected} == pytest.approx(expected)
     assert metrics["subspaces"] == count
     assert 0 < expected["success_top50"] < 1
 
 
 def test_adversarial_words_succeed_by_construction(tmp_path: Path) -> None:
-    """Why they are left out: at dimension 10 and N = 5 they alone are counted, and the data does not matter."""
+    """The reason to leave them out: at dimension 10 and N = 5 only they are counted, whatever the data."""
     task, defense = Intersections(), Affine(dim=10, database=write_dictionary(tmp_path, 160))
     metrics = task.evaluate(build_trial(defense, draw_features(12))).metrics
     assert metrics["with_adversarial_top5"] == 1
@@ -68,7 +68,7 @@ def test_words_around_the_points_succeed_and_words_between_them_fail(rng: np.ran
     assert not pass_ratio_test(between, points, 0.8).any()
 
 
-def test_what_is_left_out_makes_room_for_the_next() -> None:
+def test_words_left_out_are_replaced_by_the_next() -> None:
     match = np.array([[True, False, False, True], [False, True, True, True]])
     left_out = np.array([[True, False, False, False], [False, False, True, False]])
     assert drop_left_out(match, left_out, 2).tolist() == [[False, False], [False, True]]

@@ -1,4 +1,4 @@
-"""Localization from end to end, in Aachen's layout: what is recorded, what it leaves for other programs, and what must fail."""
+"""Localization from end to end, in Aachen's layout: records, exported files, and inputs that must fail."""
 
 import json
 from collections.abc import Callable, Iterator
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from gallery_stretch import KEPT, STRETCH, WALK
+from gallery_stretch import REFERENCES, STRETCH, WALK
 
 from attacks.inlier import Inlier
 from bench import cli
@@ -30,6 +30,8 @@ from defenses.ldp import LDP
 from defenses.none import Undefended
 from leaderboard import localization_results
 
+pytestmark = pytest.mark.slow
+
 SIFT = Sift(max_keypoints=400)
 STRICT = "recall_0.25m_2deg"
 
@@ -42,20 +44,20 @@ def _cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Fifteen references and five queries between them, of which two count as taken by night."""
-    taken = [WALK.scene().references[number] for number in STRETCH]
-    between = [image for number, image in enumerate(taken) if number not in KEPT]
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Fifteen references and five queries between them, two of which count as night images."""
+    views = [WALK.scene().references[number] for number in STRETCH]
+    between = [image for number, image in enumerate(views) if number not in REFERENCES]
     queries = [replace(image, condition="night" if number > 2 else "day") for number, image in enumerate(between)]
-    out = tmp_path_factory.mktemp("place") / "aachen"
+    out = tmp_path_factory.mktemp("dataset") / "aachen"
     scene_export.write(
-        Scene(name="stretch", references=tuple(taken[number] for number in KEPT), queries=tuple(queries)), "aachen", out
+        Scene(name="stretch", references=tuple(views[number] for number in REFERENCES), queries=tuple(queries)), "aachen", out
     )
     return out
 
 
-def run(place: Path, *defenses: Defense, **task: object) -> list[Record]:
-    return execute.run(list(defenses), task=Localization(trials=3000, **task), dataset=Aachen(path=place), extractor=SIFT)
+def run(dataset: Path, *defenses: Defense, **task: object) -> list[Record]:
+    return execute.run(list(defenses), task=Localization(trials=3000, **task), dataset=Aachen(path=dataset), extractor=SIFT)
 
 
 def mean(records: list[Record], metric: str = STRICT) -> float:
@@ -63,26 +65,26 @@ def mean(records: list[Record], metric: str = STRICT) -> float:
 
 
 @pytest.fixture(scope="module")
-def raw(place: Path) -> list[Record]:
-    return run(place, Undefended())
+def raw(dataset: Path) -> list[Record]:
+    return run(dataset, Undefended())
 
 
-def test_poses_and_what_was_retrieved_are_recorded(place: Path, raw: list[Record]) -> None:
+def test_poses_and_retrieved_references_are_recorded(dataset: Path, raw: list[Record]) -> None:
     assert mean(raw) == 1
-    truth = {query.name: query.cam_from_world for query in aachen.load(place).queries}
-    names = {reference.name for reference in aachen.load(place).references}
+    truth = {query.name: query.cam_from_world for query in aachen.load(dataset).queries}
+    names = {reference.name for reference in aachen.load(dataset).references}
     for record in raw:
         found = lists.parse_pose([repr(value) for value in record["estimates"]["pose"]], "here")
         true = truth[record["sample"]]
         assert true is not None
-        apart, turned = pose.compute_errors(found, true)
-        assert (apart, turned) == pytest.approx((record["metrics"]["translation_error"], record["metrics"]["rotation_error"]))
-        assert set(record["estimates"]["retrieved"]) == names  # of so few all
+        distance, angle = pose.compute_errors(found, true)
+        assert (distance, angle) == pytest.approx((record["metrics"]["translation_error"], record["metrics"]["rotation_error"]))
+        assert set(record["estimates"]["retrieved"]) == names  # there are fewer than `retrieved`
         assert 0 < record["metrics"]["trials"] <= 3000
 
 
-def test_exact_poses_score_everything_and_twice_the_size_nothing(place: Path) -> None:
-    for query in aachen.load(place).queries:
+def test_exact_poses_score_one_and_poses_at_twice_the_scale_zero(dataset: Path) -> None:
+    for query in aachen.load(dataset).queries:
         true = query.cam_from_world
         assert true is not None
         larger = type(true)(true.rotation, 2 * true.translation)
@@ -105,29 +107,29 @@ MATCHED: dict[str, Defense] = {
 }
 
 
-def test_each_matcher_localizes(place: Path) -> None:
-    found = {matcher: run(place, defense, matcher=matcher) for matcher, defense in MATCHED.items()}
+def test_each_matcher_localizes(dataset: Path) -> None:
+    found = {matcher: run(dataset, defense, matcher=matcher) for matcher, defense in MATCHED.items()}
     for records in found.values():
         assert mean(records) >= 0.8
         assert mean(records, "inliers") > 40
-    # Two subspaces are near each other where their descriptors are not: more accidents, and fewer inliers.
+    # Two subspaces may be close although their descriptors are not: more accidental matches, and fewer inliers.
     points, lifted = found["point-to-subspace"], found["subspace-to-subspace"]
     assert mean(lifted, "inliers") < mean(points, "inliers")
     assert mean(lifted, "matches") > mean(points, "matches")
 
 
-def test_retrieval_by_what_was_released_needs_nothing_else(place: Path) -> None:
-    """With words that tell the truth it finds the references that raw descriptors find; with random ones it does not."""
-    raw, told, random = (
-        run(place, LDP(dictionary=Asset("references"), words=1000, epsilon=epsilon), retrieval=retrieval, retrieved=3)
+def test_retrieval_by_released_words(dataset: Path) -> None:
+    """True words retrieve the same references as raw descriptors; random words do not."""
+    raw, released, random = (
+        run(dataset, LDP(dictionary=Asset("references"), words=1000, epsilon=epsilon), retrieval=retrieval, retrieved=3)
         for epsilon, retrieval in ((10.0, "raw"), (10.0, "released"), (0.0, "released"))
     )
 
-    def shared(found: list[Record]) -> float:
+    def measure_overlap(found: list[Record]) -> float:
         return float(np.mean([len({*_retrieved(one)} & {*_retrieved(other)}) / 3 for one, other in zip(raw, found, strict=True)]))
 
-    assert shared(told) > 0.6 > shared(random)
-    assert mean(told) >= 0.8
+    assert measure_overlap(released) > 0.6 > measure_overlap(random)
+    assert mean(released) >= 0.8
     assert mean(random) == 0
 
 
@@ -136,68 +138,68 @@ def _retrieved(record: Record) -> list[str]:
     return names
 
 
-def test_the_inlier_attack_verifies_whatever_the_server_can_localize(place: Path) -> None:
-    """Of subspaces all references are tried, for they do not tell which to retrieve; random words verify next to nothing."""
+def test_the_inlier_attack_verifies_what_the_server_can_localize(dataset: Path) -> None:
+    """Subspaces are matched with all references, because retrieval by them fails; random words verify almost nothing."""
     random = LDP(dictionary=Asset("references"), words=1000, epsilon=0.0)
-    found = execute.run([Undefended(), Affine(), random], [Inlier(retrieved=1, trials=3000)], dataset=Aachen(path=place))
-    verified: dict[str, list[int]] = {}
+    found = execute.run([Undefended(), Affine(), random], [Inlier(retrieved=1, trials=3000)], dataset=Aachen(path=dataset))
+    inliers: dict[str, list[int]] = {}
     for record in found:
-        verified.setdefault(record["defense"]["name"], []).append(int(record["notes"][-1].split()[0]))
-    assert min(verified["none"]) > 40
-    assert np.mean(verified["affine"]) > np.mean(verified["none"])  # of one reference's points
-    assert max(verified["ldp"]) < 20
+        inliers.setdefault(record["defense"]["name"], []).append(int(record["notes"][-1].split()[0]))
+    assert min(inliers["none"]) > 40
+    assert np.mean(inliers["affine"]) > np.mean(inliers["none"])  # of one reference's points
+    assert max(inliers["ldp"]) < 20
 
 
 # ---- controls
 
 
-def test_no_budget_localizes_nothing(place: Path) -> None:
+def test_no_budget_localizes_nothing(dataset: Path) -> None:
     """Negative control: at ε = 0 words are random, and only their number is right."""
-    assert mean(run(place, LDP(dictionary=Asset("references"), words=1000, epsilon=0.0))) == 0
+    assert mean(run(dataset, LDP(dictionary=Asset("references"), words=1000, epsilon=0.0))) == 0
 
 
-def test_words_made_up_at_random_localize_if_both_sides_have_them(place: Path, tmp_path: Path) -> None:
-    """They are a hash: near descriptors have the same nearest word. With too few of them nothing is told apart."""
+def test_random_dictionaries_localize_if_both_sides_share_them(dataset: Path, tmp_path: Path) -> None:
+    """They act as a hash: similar descriptors have the same nearest word. Too few words distinguish nothing."""
     many, few = (LDP(dictionary=write_dictionary(tmp_path, size), epsilon=np.inf, subset_size=1) for size in (2000, 200))
-    assert mean(run(place, many)) >= 0.8
-    assert mean(run(place, few)) <= 0.4
+    assert mean(run(dataset, many)) >= 0.8
+    assert mean(run(dataset, few)) <= 0.4
 
 
-# ---- what it leaves for other programs
+# ---- exported files
 
 
-def bench(place: Path, out: Path, *more: str) -> tuple[int, list[Record]]:
-    """`bench run` of raw descriptors and of words, and its records."""
-    command = ["run", "--task", "localization:trials=3000", "--dataset", f"aachen:path={place}", "--out", str(out)]
+def run_command(dataset: Path, out: Path, *more: str) -> tuple[int, list[Record]]:
+    """Run `bench run` on raw descriptors and on words. -> its exit status and records"""
+    command = ["run", "--task", "localization:trials=3000", "--dataset", f"aachen:path={dataset}", "--out", str(out)]
     defenses = more or ("--defense", "none", "--defense", "ldp:words=1000,epsilon=inf,subset_size=1")
     status = cli.main([*command, "--extractor", "sift:max_keypoints=400", *defenses])
     return status, [json.loads(line) for line in (out / "records.jsonl").read_text().splitlines()]
 
 
-def edited(place: Path, out: Path, change: Callable[[str], str]) -> Path:
-    """A copy whose list of queries by day has its first line changed."""
+def copy_with_edit(dataset: Path, out: Path, change: Callable[[str], str]) -> Path:
+    """Copy the dataset with a changed first line in the list of day queries."""
     out.mkdir()
-    for path in place.iterdir():
+    for path in dataset.iterdir():
         if path.name != "queries":
             (out / path.name).symlink_to(path)
     (out / "queries").mkdir()
-    for path in (place / "queries").iterdir():
+    for path in (dataset / "queries").iterdir():
         first, *others = path.read_text().splitlines()
         first = change(first) if path.name.startswith("day") else first
         (out / "queries" / path.name).write_text("\n".join([first, *others]) + "\n")
     return out
 
 
-def test_withheld_poses_are_handed_in_and_failures_are_counted(
-    place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_withheld_poses_are_exported_and_failures_are_counted(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """As Aachen is downloaded: no ground truth. One query's intrinsics are wrong, so it has no pose to hand in."""
-    withheld = edited(place, tmp_path / "withheld", _longer)
+    """As Aachen is downloaded: no ground truth. One query's intrinsics are wrong, so it has no pose."""
+    withheld = copy_with_edit(dataset, tmp_path / "withheld", _lengthen_focal)
     (withheld / "ground_truth.txt").unlink()
-    status, records = bench(withheld, tmp_path / "out")
+    status, records = run_command(withheld, tmp_path / "out")
     assert status == 1
-    told = capsys.readouterr().err
-    truth = {query.name.rpartition("/")[2]: query.cam_from_world for query in aachen.load(place).queries}
+    messages = capsys.readouterr().err
+    truth = {query.name.rpartition("/")[2]: query.cam_from_world for query in aachen.load(dataset).queries}
     files = sorted((tmp_path / "out").glob("Aachen_eval_*.txt"))
     assert [path.name for path in files] == [
         "Aachen_eval_ldp_epsilon_inf_subset_size_1_words_1000-seed0.txt",
@@ -205,59 +207,60 @@ def test_withheld_poses_are_handed_in_and_failures_are_counted(
     ]
     for path in files:
         found = lists.read_poses(path)
-        assert f"{path}: 4 poses; 1 queries that failed are left out" in told
+        assert f"{path}: 4 poses; 1 queries that failed are left out" in messages
         assert len(found) == 4 == len(truth) - 1
-        for name, (_, there) in found.items():
+        for name, (_, pose_found) in found.items():
             true = truth[name]
             assert true is not None
-            assert pose.compute_errors(there, true)[0] < 0.25
+            assert pose.compute_errors(pose_found, true)[0] < 0.25
     for record in records:
         if record["status"] == "ok":
             assert not {STRICT, "translation_error"} & record["metrics"].keys()
             assert record["notes"] == ["its pose is withheld"]
 
 
-def _longer(line: str) -> str:
-    """A list's line whose focal length is half as long again."""
+def _lengthen_focal(line: str) -> str:
+    """Return a list's line with 1.5 times the focal length."""
     name, model, width, height, focal, *others = line.split()
     return " ".join([name, model, width, height, str(1.5 * float(focal)), *others])
 
 
 def test_wrong_intrinsics_are_reported_and_not_averaged(
-    place: Path, raw: list[Record], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    dataset: Path, raw: list[Record], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    status, records = bench(edited(place, tmp_path / "wrong", _longer), tmp_path / "out", "--defense", "none")
+    status, records = run_command(
+        copy_with_edit(dataset, tmp_path / "wrong", _lengthen_focal), tmp_path / "out", "--defense", "none"
+    )
     assert status == 1
     failed = [record for record in records if record["status"] == "failed"]
     assert [record["sample"] for record in failed] == [raw[0]["sample"]]
-    assert "its intrinsics do not fit; its raw features ask for 0.6" in failed[0]["reason"]
+    assert "its intrinsics are wrong; its raw features fit 0.6" in failed[0]["reason"]
     assert failed[0]["metrics"] == {}
     assert failed[0]["reason"] in capsys.readouterr().out
     assert mean([record for record in records if record["status"] == "ok"]) == 1
 
 
-def test_pairs_are_written_and_read_again(place: Path, raw: list[Record], tmp_path: Path) -> None:
-    written = tmp_path / "pairs.txt"
-    assert next(localization_results.write(raw, tmp_path)) == f"{written}: what was retrieved for 5 queries"
-    assert pairs.read(written) == {record["sample"]: _retrieved(record) for record in raw}
-    again = run(place, Undefended(), pairs=written)
+def test_pairs_are_written_and_read_again(dataset: Path, raw: list[Record], tmp_path: Path) -> None:
+    path = tmp_path / "pairs.txt"
+    assert next(localization_results.write(raw, tmp_path)) == f"{path}: what was retrieved for 5 queries"
+    assert pairs.read(path) == {record["sample"]: _retrieved(record) for record in raw}
+    again = run(dataset, Undefended(), pairs=path)
     assert [record["metrics"] for record in again] == [record["metrics"] for record in raw]
-    kept = {query: references[:2] for query, references in pairs.read(written).items()}
-    pairs.write(written, kept)
-    fewer = run(place, Undefended(), pairs=written)
-    assert {record["sample"]: _retrieved(record) for record in fewer} == kept
+    shortened = {query: references[:2] for query, references in pairs.read(path).items()}
+    pairs.write(path, shortened)
+    fewer = run(dataset, Undefended(), pairs=path)
+    assert {record["sample"]: _retrieved(record) for record in fewer} == shortened
     assert mean(fewer, "matches") < mean(raw, "matches")
     other = [{**record, "experiment_id": "other", "defense": {"name": "affine", "dim": 2}} for record in fewer]
-    assert len(list(localization_results.write([*raw, *other], tmp_path))) == 4  # of each its pairs and its poses
-    assert pairs.read(tmp_path / "pairs-affine_dim_2-seed0.txt") == kept
+    assert len(list(localization_results.write([*raw, *other], tmp_path))) == 4  # pairs and poses of each
+    assert pairs.read(tmp_path / "pairs-affine_dim_2-seed0.txt") == shortened
 
 
-def test_pairs_with_a_stranger_are_a_mistake(place: Path, tmp_path: Path) -> None:
+def test_pairs_with_an_unknown_reference_are_refused(dataset: Path, tmp_path: Path) -> None:
     path = tmp_path / "pairs.txt"
-    path.write_text("query/day/0.png db/stranger.png\n")
-    reference = aachen.load(place).queries[0].name
-    path.write_text(f"{reference} db/stranger.png\n")
-    (failed, *_) = run(place, Undefended(), pairs=path)
-    assert failed["reason"] == f"{path}: db/stranger.png is no reference of the map"
+    query = aachen.load(dataset).queries[0].name
+    path.write_text(f"{query} db/unknown.png\n")
+    (failed, *_) = run(dataset, Undefended(), pairs=path)
+    assert failed["reason"] == f"{path}: db/unknown.png is no reference of the map"
     with pytest.raises(UserError, match="retrieved and trials must be at least 1"):
         Localization(retrieved=0)

@@ -19,9 +19,9 @@ LAYERS = ("features.3", "features.8", "features.15")  # the last layers before V
 def module(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
     """The module, with an empty TORCH_HOME."""
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
-    perceptual_loss._vgg.cache_clear()
+    perceptual_loss._load_vgg.cache_clear()
     yield perceptual_loss
-    perceptual_loss._vgg.cache_clear()
+    perceptual_loss._load_vgg.cache_clear()
 
 
 @pytest.fixture
@@ -39,6 +39,7 @@ def stored(module: Any) -> dict[str, torch.Tensor]:
     return weights
 
 
+@pytest.mark.slow
 def test_vgg_features_agree_with_torchvision(module: Any, stored: dict[str, torch.Tensor]) -> None:
     from torchvision.models.feature_extraction import create_feature_extractor
 
@@ -56,6 +57,7 @@ def test_vgg_features_agree_with_torchvision(module: Any, stored: dict[str, torc
     assert float((found[0] - raw[LAYERS[0]]).norm() / raw[LAYERS[0]].norm()) > 0.2  # control: colours without normalisation
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("stored")
 def test_the_loss_grows_with_the_difference_and_has_a_gradient(module: Any) -> None:
     photograph = torch.rand(1, 3, 64, 64)
@@ -73,6 +75,7 @@ def test_the_loss_grows_with_the_difference_and_has_a_gradient(module: Any) -> N
     assert float(module.measure_dissimilarity(nearer, photograph, module.extract_vgg)) < costs[1]
 
 
+@pytest.mark.slow
 def test_nothing_is_downloaded(module: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.hub, "download_url_to_file", lambda *_, **__: pytest.fail("a download"))
     with pytest.raises(UserError, match=r"vgg16-397923af\.pth: no such file"):

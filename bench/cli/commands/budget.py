@@ -29,7 +29,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def execute(args: argparse.Namespace) -> int:
     from bench.codebook.public import Public
-    from bench.core.table import to_terminal
     from bench.mechanisms import budget
     from bench.runner import records
     from leaderboard.tables import build_tables
@@ -43,5 +42,5 @@ def execute(args: argparse.Namespace) -> int:
             for record in budget.select_nearest_records(records.read(records.find_file(args.results)).records, plan.epsilon)
         ]
         print(f"Nearest measured setting: ε = {float(measured[0]['privacy']['epsilon_descriptor']):g} for a descriptor")
-        print_rich(*map(to_terminal, build_tables(measured, brief=True)))
+        print_rich(*build_tables(measured, brief=True))
     return DONE

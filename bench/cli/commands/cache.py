@@ -76,18 +76,16 @@ def _select(args: argparse.Namespace) -> list[Entry]:
 def _list(entries: list[Entry]) -> None:
     from datetime import datetime
 
-    from rich.table import Table
-
     from bench.cache import store
+    from bench.core.table import build_table
 
-    table = Table(title=f"{store.cache_folder()}: {len(entries)} entries, {_format_total(entries)}", title_justify="left")
-    for column in ("kind", "entries", "size", "last used"):
-        table.add_column(column, justify="left" if column == "kind" else "right")
+    rows = []
     for kind in sorted({entry.kind for entry in entries}):
         of_kind = [entry for entry in entries if entry.kind == kind]
         last = datetime.fromtimestamp(max(entry.used for entry in of_kind))
-        table.add_row(kind, str(len(of_kind)), _format_total(of_kind), f"{last:%Y-%m-%d %H:%M}")
-    print_rich(table)
+        rows.append((kind, str(len(of_kind)), _format_total(of_kind), f"{last:%Y-%m-%d %H:%M}"))
+    heading = f"{store.cache_folder()}: {len(entries)} entries, {_format_total(entries)}"
+    print_rich(build_table(("kind", "entries", "size", "last used"), rows, text=("kind",), heading=heading))
 
 
 def _verify(entries: list[Entry]) -> int:

@@ -32,7 +32,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(args: argparse.Namespace) -> int:
-    from bench.core.table import to_terminal
     from bench.runner import records
     from leaderboard import regression, regression_report, speed
 
@@ -45,7 +44,7 @@ def execute(args: argparse.Namespace) -> int:
     if args.format == "github":
         print(*map(regression_report.to_github, shown), sep="\n", end="\n" if shown else "")
     elif shown:
-        print_rich(to_terminal(regression_report.build_results_table(shown)))
+        print_rich(regression_report.build_results_table(shown))
     print(regression_report.summarize(found))
     verdicts = {finding.verdict for finding in found}
     if verdicts & {"worse", "weaker"}:

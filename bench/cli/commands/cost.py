@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import sys
 
 from bench.cli.terminal import DONE, parse_whole, print_rich
@@ -15,7 +16,6 @@ examples:
   bench cost --queries 1000000 --keypoints 2000 --words 32000
 """
 REQUIRED = ()
-COLUMNS = ("who", "step", "operations", "bytes", "core seconds", "TB a day", "cores")
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -45,21 +45,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(args: argparse.Namespace) -> int:
-    from rich.table import Table
-
+    from bench.core.table import to_markdown
     from leaderboard import cost
-    from leaderboard.tables import markdown_row
 
     service = cost.Service(keypoints=args.keypoints, words=args.words, subset_size=args.subset_size, references=args.references)
-    rows = cost.rows(service, cost.measure_rates(service), args.queries)
+    table = cost.build_cost_table(service, cost.measure_rates(service), args.queries)
     if args.markdown:
-        lines = [markdown_row(COLUMNS), markdown_row("---" for _ in COLUMNS), *map(markdown_row, rows)]
-        sys.stdout.write("\n".join(lines) + "\n")
-        return DONE
-    table = Table(title=f"A query of {args.keypoints} keypoints, and {args.queries:,} a day", title_justify="left")
-    for column in COLUMNS:
-        table.add_column(column, justify="left" if column in COLUMNS[:2] else "right")
-    for row in rows:
-        table.add_row(*row)
-    print_rich(table)
+        sys.stdout.write(to_markdown(dataclasses.replace(table, heading=""), plain=True))
+    else:
+        print_rich(table)
     return DONE

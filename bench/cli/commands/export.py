@@ -39,7 +39,7 @@ def execute(args: argparse.Namespace) -> int:
     from bench.formats import pairs
     from bench.registry import discovery, spec
     from bench.runner import feature_export
-    from bench.runner.plan import build_plan
+    from bench.runner.plan import RunConfiguration, build_plan
     from bench.runner.trial import TrialRunner
     from bench.tasks.reconstruction import Reconstruction
 

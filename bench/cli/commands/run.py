@@ -81,7 +81,7 @@ def execute(args: argparse.Namespace) -> int:
     records = watch.execute_with_progress(
         [plan], out, engine, f"{task.name()}: {len(plan.samples)} samples, {len(plan.experiments)} pairs"
     )
-    run_report.write(records, plan.samples, out)
+    run_report.write(records, out)
     _print_records(records) if args.json else watch.print_tables(records)
     for line in localization_results.write(records, out):
         print_status(DONE, line)

@@ -62,5 +62,5 @@ def execute(args: argparse.Namespace) -> int:
         keypoints=args.keypoints, repeatability=repeated or [args.repeated], points=args.points, trials=args.trials
     )
     rows = subset_size.estimate_sizes(args.epsilon, words, sizes, service)
-    print_rich(*subset_size.report(rows, args.epsilon, words, recalls))
+    print_rich(subset_size.report(rows, args.epsilon, words, recalls))
     return DONE

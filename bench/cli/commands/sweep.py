@@ -50,8 +50,7 @@ def execute(args: argparse.Namespace) -> int:
     out = args.out or suite.choose_folder(args.suite)
     pairs = sum(len(plan.experiments) for plan in plans)
     records = watch.execute_with_progress(plans, out, engine, f"{args.suite}: {pairs} pairs")
-    samples = {sample.name: sample for plan in plans for sample in plan.samples}
-    run_report.write(records, list(samples.values()), out)
+    run_report.write(records, out)
     watch.print_tables(records)
     print_status(DONE, f"written to {out}")
     return FAILED if any(record["status"] == "failed" for record in records) else DONE

@@ -65,7 +65,7 @@ def draw_figures(data: FigureData) -> Iterator[tuple[str, Figure]]:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9.6, 3.9), layout="constrained", dpi=120)
-    photographs = len(data.test_set.photographs)
+    photographs = len(data.evaluation_set.photographs)
     average = f"mean over {photographs} photograph{'s' * (photographs > 1)}"
     figure.suptitle(f"The intersection attack, which knows no database; stars: the database attack; {average}", fontsize=9)
     recovery_axes, ssim_axes = figure.subplots(1, 2)

@@ -1,4 +1,4 @@
-"""Paints a photograph from the keypoints of any release, and counts how often it was asked."""
+"""Draws a dot at each keypoint of any release, and counts its calls."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ from bench.types import Descriptors, Floats, Subspaces, WordSets
 
 
 @dataclass(frozen=True, kw_only=True)
-class Painter(ImageAttack):
+class Sketch(ImageAttack):
     """Noise, with a dot at each keypoint."""
 
     accepts = (Descriptors, WordSets, Subspaces)
@@ -24,4 +24,4 @@ class Painter(ImageAttack):
         return image
 
 
-PLUGIN = Painter
+PLUGIN = Sketch
