@@ -33,6 +33,8 @@ lint: .venv/ready-to-test
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/mypy tools
+	$(BIN)/lint-imports
+	$(BIN)/python tools/check_vocabulary.py
 
 smoke: .venv/ready # with three seeds, whose spread says what may be chance
 	for seed in 0 1 2; do $(BIN)/bench run $(SMOKE) --seed $$seed --out runs/smoke > /dev/null || exit; done

@@ -76,7 +76,7 @@ class Defense(Plugin, ABC):
         """Return the guarantee for one descriptor, and the probability of the true word where it can be computed."""
 
     def distance(self, secret: Features, public: Public, one: int, other: int) -> Fraction:
-        """Return the distance of two descriptors in the guarantee. ε-LDP puts all others at 1; a descriptor's own distance is 0."""
+        """Return the distance of two descriptors in the guarantee: under ε-LDP 1, and 0 of a descriptor to itself."""
         return Fraction(int(one != other))
 
     def is_memoized(self) -> bool:
@@ -293,7 +293,7 @@ class Extractor(Plugin, ABC):
         """
 
     def mirror_order(self) -> Indices | None:
-        """Return the order (D,) in which a descriptor's components are those of the mirrored photograph's; None if there is none."""
+        """Return the order (D,) of a descriptor's components in the mirrored photograph; None if there is none."""
         return None
 
     def turn_order(self) -> Indices | None:

@@ -56,7 +56,8 @@ def check_defense(defense: Defense, public: Public, secret: Features) -> None:
     _check_release(release, len(secret))
     assert are_equal(release, defense.protect(secret, public, np.random.default_rng(1))), "the same rng gave another release"
     if not isinstance(release, Descriptors):
-        assert not are_equal(release, defense.protect(secret, public, np.random.default_rng(2))), "another rng gave the same release"
+        other = defense.protect(secret, public, np.random.default_rng(2))
+        assert not are_equal(release, other), "another rng gave the same release"
     privacy = defense.privacy(public)
     assert privacy.guarantee
     assert privacy.epsilon is None or privacy.epsilon >= 0
@@ -83,8 +84,8 @@ def check_attack(
 ) -> None:
     """Check that an attack returns what its class declares, and reads the release and its declared knowledge alone.
 
-    Its result must be bit-identical when the secret and the caches are overwritten after the release, those on disk too. An attack
-    that needs the server's map is checked with a `sample` of the scene of `scene_index`.
+    Its result must be bit-identical when the secret and the caches are overwritten after the release, those on disk too. An
+    attack that needs the server's map is checked with a `sample` of the scene of `scene_index`.
     """
     with tempfile.TemporaryDirectory() as folder, store.use_folder(Path(folder)):
         _check_attack(attack, defense, extractor, secret, sample, scene_index)

@@ -41,7 +41,7 @@ def choose_styles(families: Iterable[str]) -> dict[str, PlotStyle]:
     return {family: STYLES[index % len(STYLES)] for index, family in enumerate(dict.fromkeys(families))}
 
 
-def place_labels(
+def position_labels(
     points: Sequence[tuple[float, float]], sizes: Sequence[tuple[float, float]], size: tuple[float, float], gap: float = 9.0
 ) -> list[tuple[float, float] | None]:
     """Return a position for each label that covers no point, no other label and no border; None if there is no room.

@@ -11,7 +11,7 @@ from leaderboard.comparison import ComparisonGroup
 from leaderboard.figures import escape_text
 from leaderboard.intervals import Interval
 from leaderboard.measures import PRIVACY, list_measures
-from leaderboard.plot_style import PlotStyle, choose_styles, place_labels
+from leaderboard.plot_style import PlotStyle, choose_styles, position_labels
 from leaderboard.ranking import Standing, rank_defenses
 from leaderboard.tables import build_labels, format_setting
 from leaderboard.tradeoff import Tradeoff
@@ -194,7 +194,7 @@ def _write_settings(axes: Axes, tradeoff: Tradeoff) -> None:
     points = [(x * size[0], (1 - y) * size[1]) for x, y in within]
     texts = label_points(tradeoff)
     sizes = [(LETTER[0] * min(len(text), BRIEF), LETTER[1]) for text in texts]
-    for text, position in zip(texts, place_labels(points, sizes, size), strict=True):
+    for text, position in zip(texts, position_labels(points, sizes, size), strict=True):
         if position:
             left, up = position[0] / size[0], 1 - position[1] / size[1]
             axes.text(left, up, _shorten(text), fontsize=7, color="0.2", va="center", transform=axes.transAxes)

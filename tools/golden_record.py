@@ -189,8 +189,8 @@ def close(old: Any, new: Any) -> bool:
 def constant_sources() -> Iterator[None]:
     """Hold the digests of our own source constant, and use an empty cache."""
     with (
-        mock.patch.object(provenance, "hash_modules", lambda *modules: "sha256:constant"),
-        mock.patch.object(gallery, "_hash_renderer", lambda: "constant"),
+        mock.patch.object(provenance, "hash_modules", return_value="sha256:constant"),
+        mock.patch.object(gallery, "_hash_renderer", return_value="constant"),
         tempfile.TemporaryDirectory() as folder,
         store.use_folder(Path(folder)),
     ):

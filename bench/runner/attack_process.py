@@ -1,8 +1,8 @@
 """Executes an attack in a process that never holds the secret.
 
-The process starts afresh. It receives the attack, and what `bench run` would show it: the release, configurations, and the knowledge
-that it declared to need, on request. The photograph and the true descriptors stay with the process that scores. The answer is JSON
-and arrays, never pickled objects, so that no code of the attack runs where the secret is.
+The process starts afresh. It receives the attack, and what `bench run` would show it: the release, configurations, and the
+knowledge that it declared to need, on request. The photograph and the true descriptors stay with the process that scores. The
+answer is JSON and arrays, never pickled objects, so that no code of the attack runs where the secret is.
 
 The two processes share no memory. This is no security sandbox: the attack process may read every file that its user may read, and
 both processes import the plugin's module.

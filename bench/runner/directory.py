@@ -1,7 +1,7 @@
 """The files of a run's folder beside its records: the plan, pictures, tracebacks, and the running jobs.
 
-`bench status` reads these files alone. `plan.json` is the last plan of the folder. `running.json` lists the jobs that run; the lock
-on the records tells whether their process lives, for the system lifts it when a process ends.
+`bench status` reads these files alone. `plan.json` is the last plan of the folder. `running.json` lists the jobs that run.
+The lock on the records shows whether their process lives: the system lifts it when a process ends.
 """
 
 from __future__ import annotations

@@ -144,7 +144,10 @@ def build_plan(configuration: RunConfiguration, describe: Describe = environment
             "task_settings": _settings(task),
             "metric_settings": metric_settings,
             "seed": seed,
-            "sources": {"defense": environment.hash_plugin_file(defense), "attack": attack and environment.hash_plugin_file(attack)},
+            "sources": {
+                "defense": environment.hash_plugin_file(defense),
+                "attack": attack and environment.hash_plugin_file(attack),
+            },
             "experiment_id": experiment_id,
             "run_hash": records.run_hash(experiment_id, environment_record),
             "environment": environment_record,

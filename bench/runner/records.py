@@ -62,7 +62,7 @@ class Contents:
 def read(path: Path) -> Contents:
     """Read a file of records of schema 2 or 1; a last line that a crash cut off is left out.
 
-    Records of schema 1 come out with the names and hashes of schema 2, and keep their `cell_id`, which names their pictures' folder.
+    Records of schema 1 come out with the names and hashes of schema 2. Their `cell_id` stays: it names their pictures' folder.
 
     Raises
     ------
@@ -200,12 +200,12 @@ def explain_invalid(record: Any) -> str | None:
     if "task_settings" not in record:  # the oldest records of schema 1 do not hold all that they hash
         return None
     try:
-        cell = short_hash([1, *_configuration(record)])
+        experiment = short_hash([1, *_configuration(record)])
         run = run_hash(record["cell_id"], record["environment"])
     except (KeyError, TypeError, AttributeError) as error:
         return f"not a whole record of schema 1 ({type(error).__name__}: {error})"
-    if cell != record["cell_id"]:
-        return f"cell_id: is {record['cell_id']}, but that of this configuration is {cell}"
+    if experiment != record["cell_id"]:
+        return f"cell_id: is {record['cell_id']}, but that of this configuration is {experiment}"
     if run != record["run_hash"]:
         return f"run_hash: is {record['run_hash']}, but that of this cell and environment is {run}"
     return None

@@ -105,7 +105,8 @@ class TrialRunner:
                 for number in range(1, 1 + (0 if attack is None else attack.repeats()))
             ),
             execute=plan.execute,
-            provenance=provenance if plan.execute is execute_in_process else None,  # another process must execute the attack itself
+            # A cached result would keep another process from executing the attack.
+            provenance=provenance if plan.execute is execute_in_process else None,
         )
 
     def protect(self, experiment: Experiment, features: Features, content: str, *repetition: int | str) -> Release:
@@ -152,9 +153,7 @@ class TrialRunner:
         seconds = time.perf_counter() - started + outcome.saved_seconds
         keypoints = max(len(image.secret) for image in trial.images)
         notes = [note for image in trial.images for note in image.notes]
-        record = build_record(
-            experiment, sample, status="ok", outcome=outcome, keypoints=keypoints, notes=notes, seconds=seconds
-        )
+        record = build_record(experiment, sample, status="ok", outcome=outcome, keypoints=keypoints, notes=notes, seconds=seconds)
         if outcome.image is None:
             return Result(record=record)
         photograph = None if self._pictured == sample.name else _encode_png(trial.pixels())

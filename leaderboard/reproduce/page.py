@@ -206,7 +206,7 @@ def list_statements(result: ClaimResult) -> list[str]:
     return [_format_evidence(evidence) for verdict in listed for evidence in result.evidence if evidence.verdict is verdict]
 
 
-_PLURAL = {Verdict.HOLDS: "hold", Verdict.FAILS: "do not hold", Verdict.OPEN: "cannot be told"}
+_PLURAL = {Verdict.HOLDS: "hold", Verdict.FAILS: "do not hold", Verdict.OPEN: "cannot be decided"}
 
 
 def _format_evidence(evidence: Evidence) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from leaderboard.intervals import Interval
-from leaderboard.plot_style import PlotStyle, place_labels
+from leaderboard.plot_style import PlotStyle, position_labels
 from leaderboard.plots import choose_family_styles, label_points
 from leaderboard.tables import format_number
 from leaderboard.tradeoff import Point, Tradeoff
@@ -89,7 +89,7 @@ def build_charts(tradeoffs: Sequence[Tradeoff]) -> list[Chart]:
 def _build_chart(tradeoff: Tradeoff, x: Scale, y: Scale) -> Chart:
     positions = [(x(point.utility.mean), y(point.privacy.mean)) for point in tradeoff.points]
     texts = label_points(tradeoff)
-    labels = place_labels(
+    labels = position_labels(
         [(across - LEFT, up - TOP) for across, up in positions],
         [(LETTER[0] * len(text), LETTER[1]) for text in texts],
         (WIDTH - LEFT - RIGHT, HEIGHT - TOP - BOTTOM),

@@ -150,10 +150,10 @@ def test_unusable_databases(images: Path, tmp_path: Path) -> None:
         ColmapDatabase(path=images / "b.png")
     out = tmp_path / "database.db"
     assert export("--images", images, "--layout", "colmap", "--out", out) == 0
-    stranger = tmp_path / "stranger.png"
-    draw_texture(9, (300, 200)).save(stranger)
+    unrelated = tmp_path / "unrelated.png"
+    draw_texture(9, (300, 200)).save(unrelated)
     with pytest.raises(SampleError, match="no image of that name"):
-        ColmapDatabase(path=out).extract(photographs.read(stranger).pixels, stranger)
+        ColmapDatabase(path=out).extract(photographs.read(unrelated).pixels, unrelated)
     draw_texture(9, (100, 200)).save(images / "b.png")
     with pytest.raises(SampleError, match="the photograph has"):
         ColmapDatabase(path=out).extract(photographs.read(images / "b.png").pixels, images / "b.png")

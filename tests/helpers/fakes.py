@@ -103,7 +103,12 @@ def build_trial(
 
 
 def prepare_plan(
-    defenses: Sequence[Defense], attacks: Sequence[Attack], images: Images, task: Task, describe: Describe = environment.describe, **more: Any
+    defenses: Sequence[Defense],
+    attacks: Sequence[Attack],
+    images: Images,
+    task: Task,
+    describe: Describe = environment.describe,
+    **more: Any,
 ) -> Plan:
     """Build a plan of every pair and dry-run it, as `bench run` does."""
     configuration = RunConfiguration(

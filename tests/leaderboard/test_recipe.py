@@ -128,9 +128,9 @@ def fabricate(records: list[dict[str, Any]]) -> GroupedExperiment:
 
 
 def test_a_plugin_that_is_not_installed_has_all_its_fields() -> None:
-    stranger = {"name": "stranger", "levels": 8, "soft": True, "rate": 0.5, "file": None}
-    (command,) = build_recipe(fabricate(reconstructions(stranger, [0.5], attack={"name": "unheard-of"}))).command.splitlines()
-    assert "--defense stranger:levels=8,soft=true,rate=0.5,file=none --attack unheard-of" in command
+    unrelated = {"name": "unrelated", "levels": 8, "soft": True, "rate": 0.5, "file": None}
+    (command,) = build_recipe(fabricate(reconstructions(unrelated, [0.5], attack={"name": "unheard-of"}))).command.splitlines()
+    assert "--defense unrelated:levels=8,soft=true,rate=0.5,file=none --attack unheard-of" in command
 
 
 def test_each_seed_has_its_line() -> None:

@@ -269,7 +269,7 @@ def test_failures_and_not_applicable_rows_are_in_every_output() -> None:
     markdown = page.to_markdown(table)
     assert "does not hold: [two] ssim > [four] ssim: paper 0.1, ours -0.1 [-0.1, -0.1]" in markdown
     assert "cannot tell: [raw] ssim > [none] ssim: paper 0.6, nothing measured (none: n/a: no network)" in markdown
-    assert "(Of 6: 2 hold, 1 do not hold, 3 cannot be told.)" in markdown
+    assert "(Of 6: 2 hold, 1 do not hold, 3 cannot be decided.)" in markdown
     values = page.compare_values(table)
     assert list(values["n"]) == ["7", "8", "8", "0"]
     assert values["ssim, ours"].iloc[3] == "n/a"

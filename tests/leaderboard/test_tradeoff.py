@@ -10,7 +10,7 @@ from fabricated import DIA, ENVIRONMENT, GALLERY, PHOTOGRAPHS, inapplicable, ldp
 
 from leaderboard import comparison, plots
 from leaderboard.comparison import ComparisonGroup
-from leaderboard.plot_style import STYLES, choose_styles, place_labels
+from leaderboard.plot_style import STYLES, choose_styles, position_labels
 from leaderboard.site.chart import build_charts
 from leaderboard.tradeoff import Tradeoff, build_tradeoffs, pareto
 
@@ -146,8 +146,8 @@ def test_labels_cover_nothing() -> None:
     rng = np.random.default_rng(0)
     points = [(float(x), float(y)) for x, y in rng.uniform(0, 300, (12, 2))]
     sizes = [(60.0, 12.0)] * len(points)
-    placed = place_labels(points, sizes, (300.0, 300.0))
-    boxes = [(x, y - 6, x + 60, y + 6) for position in placed if position for x, y in [position]]
+    positions = position_labels(points, sizes, (300.0, 300.0))
+    boxes = [(x, y - 6, x + 60, y + 6) for position in positions if position for x, y in [position]]
     assert len(boxes) > 6
     for number, (left, top, right, bottom) in enumerate(boxes):
         assert left >= 0
@@ -157,15 +157,15 @@ def test_labels_cover_nothing() -> None:
         assert not any(left < x < right and top < y < bottom for x, y in points)
         for a, b, c, d in boxes[number + 1 :]:
             assert right <= a or c <= left or bottom <= b or d <= top
-    assert place_labels([(5.0, 5.0)], [(400.0, 12.0)], (300.0, 300.0)) == [None]
+    assert position_labels([(5.0, 5.0)], [(400.0, 12.0)], (300.0, 300.0)) == [None]
 
 
 def test_labels_are_read_as_their_points() -> None:
     """Also where points lie together: some of them have none then."""
     points = [(150.0, 150.0), (150.0, 157.0), (150.0, 164.0), (40.0, 40.0)]
-    placed = place_labels(points, [(60.0, 12.0)] * 4, (300.0, 300.0))
-    assert placed[3] is not None
-    for number, position in enumerate(placed):
+    positions = position_labels(points, [(60.0, 12.0)] * 4, (300.0, 300.0))
+    assert positions[3] is not None
+    for number, position in enumerate(positions):
         if position:
             left, middle = position
             distances = [np.hypot(max(left - x, 0, x - left - 60), max(abs(y - middle) - 6, 0)) for x, y in points]

@@ -126,7 +126,7 @@ def test_a_guarantee_by_distance_is_in_no_epsilon_column(tmp_path: Path) -> None
     assert (privacy["guarantee"], privacy["epsilon_per_distance"]) == ("d-chi", 16.0)
     assert [privacy[name] for name in ("epsilon_descriptor", "epsilon_image", "epsilon_image_optimal")] == [None] * 3
     assert "epsilon_per_distance" not in records[1]["privacy"]
-    schema = json.loads((ASSETS / "record.schema.json").read_text(encoding="utf-8"))
+    schema = json.loads((ASSETS / "record-2.schema.json").read_text(encoding="utf-8"))
     for record in records:
         jsonschema.validate(record, schema)
     (table,) = tables.build_tables(records)
@@ -179,7 +179,7 @@ class WithoutTheTwo(Exponential):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class InOtherUnits(MetricLDP):
+class Rescaled(MetricLDP):
     """Measures distance in eighths of the unit of its guarantee."""
 
     def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> WordSets:
@@ -192,7 +192,7 @@ def test_broken_variants_are_detected(tmp_path: Path) -> None:
     assert found.enumeration is not None
     assert found.enumeration.exceeds
     assert not any(finding.certain_epsilon > found.claimed for finding in found.findings)  # too little for so few trials
-    found = audit(InOtherUnits(epsilon=1.0), 8, 20_000, 0, tmp_path)
+    found = audit(Rescaled(epsilon=1.0), 8, 20_000, 0, tmp_path)
     assert {finding.family for finding in found.findings if finding.certain_epsilon > 1.0} >= {"membership", "position"}
 
 

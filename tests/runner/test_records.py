@@ -13,7 +13,6 @@ from bench.core.errors import UserError
 from bench.runner import records
 from bench.runner.records import Log, read
 
-
 SCHEMA_1 = Path(__file__).resolve().parents[1] / "data" / "records-schema-1.jsonl"  # written by version 0.1
 
 
@@ -159,10 +158,10 @@ def test_a_lost_line_is_reported(tmp_path: Path, caplog: pytest.LogCaptureFixtur
     assert "cut off" in caplog.text
 
 
-def test_cell_does_not_depend_on_the_name_of_the_folder_or_the_order_of_keys() -> None:
-    def cell(**dataset: Any) -> str:
+def test_experiment_id_does_not_depend_on_the_name_of_the_folder_or_the_order_of_keys() -> None:
+    def experiment(**dataset: Any) -> str:
         return records.experiment_id("t", {"name": "ldp", "epsilon": 1.0}, None, dataset, 0, {})
 
-    assert cell(name="a", hash="1") == cell(hash="1", name="b")
-    assert cell(hash="1") != cell(hash="2")
+    assert experiment(name="a", hash="1") == experiment(hash="1", name="b")
+    assert experiment(hash="1") != experiment(hash="2")
     assert records.run_hash("a", {"torch": "1"}) != records.run_hash("a", {"torch": "2"})

@@ -143,8 +143,8 @@ def test_release_depends_on_neither_the_attack_nor_the_order_nor_other_samples(i
 
 def test_releases_that_are_done_with_are_let_go_of_at_once(images: Path, small: Asset) -> None:
     plan = prepare_plan([LDP(dictionary=small)], [Sketch()], images, task=RECONSTRUCTION)
-    trials, (cell,), unit = TrialRunner(plan), plan.experiments, plan.samples[0]
-    release = weakref.ref(trials.build_trial(cell, unit).images[0].release)
+    trials, (experiment,), sample = TrialRunner(plan), plan.experiments, plan.samples[0]
+    release = weakref.ref(trials.build_trial(experiment, sample).images[0].release)
     gc.disable()
     try:
         assert release() is not None  # for the next attack on it
@@ -152,16 +152,16 @@ def test_releases_that_are_done_with_are_let_go_of_at_once(images: Path, small: 
         assert release() is None
     finally:
         gc.enable()
-    assert trials.execute(cell, unit).record["status"] == "ok"
+    assert trials.execute(experiment, sample).record["status"] == "ok"
 
 
 def test_all_attacks_see_the_same_release(images: Path, small: Asset, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[View] = []
 
-    def spoiling(kept: Callable[..., Any]) -> Callable[..., Any]:
+    def spoiling(original: Callable[..., Any]) -> Callable[..., Any]:
         def spoil(self: Any, view: View, rng: np.random.Generator) -> Any:
             seen.append(copy.deepcopy(view))
-            estimate = kept(self, view, rng)
+            estimate = original(self, view, rng)
             view.release.keypoints[:] = 0  # what one attack does to its release is nothing to the next
             return estimate
 
@@ -223,7 +223,7 @@ def test_bad_photograph_is_a_failed_record_and_the_others_are_done(images: Path,
     assert records[2]["privacy"]["epsilon_image_optimal"] is None
 
 
-def test_broken_plugin_fails_its_own_cells_and_leaves_a_traceback(images: Path, tmp_path: Path) -> None:
+def test_broken_plugin_fails_its_own_experiments_and_leaves_a_traceback(images: Path, tmp_path: Path) -> None:
     records = run([Broken(), Undefended()], [Sketch()], images, out=tmp_path / "out")
     assert [record["status"] for record in records] == ["failed", "ok", "failed", "ok"]
     assert records[0]["reason"] == "internal error in plugin broken: TypeError: unsupported operand"
@@ -320,7 +320,7 @@ def test_interrupted_run_goes_on_and_ends_as_if_it_had_not_been(images: Path, sm
     assert len(file.read_bytes().splitlines()) == 4
 
 
-def test_failed_units_are_tried_again(images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failed_samples_are_tried_again(images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as broken:
         broken.setattr(Sketch, "reconstruct", lambda self, view, rng: None)
         assert {record["status"] for record in run([Undefended()], [Sketch()], images, out=tmp_path / "out")} == {"failed"}
@@ -329,15 +329,17 @@ def test_failed_units_are_tried_again(images: Path, tmp_path: Path, monkeypatch:
     assert judged(again) == judged(run([Undefended()], [Sketch()], images))
 
 
-def test_changed_photograph_or_setting_is_another_cell(images: Path) -> None:
-    def cell(**more: Any) -> str:
-        return prepare_plan([Undefended()], [Sketch()], images, task=RECONSTRUCTION, **more).experiments[0].metadata["experiment_id"]
+def test_changed_photograph_or_setting_is_another_experiment(images: Path) -> None:
+    def experiment(**more: Any) -> str:
+        return (
+            prepare_plan([Undefended()], [Sketch()], images, task=RECONSTRUCTION, **more).experiments[0].metadata["experiment_id"]
+        )
 
-    first = cell()
-    assert cell() == first
-    assert cell(seed=1) != first
+    first = experiment()
+    assert experiment() == first
+    assert experiment(seed=1) != first
     shutil.copy(images / "0.png", images / "1.png")
-    assert cell() != first
+    assert experiment() != first
 
 
 def test_damaged_records_stop_the_run_before_it_starts(images: Path, tmp_path: Path) -> None:
@@ -415,7 +417,9 @@ def test_processes_make_the_same_records(images: Path, small: Asset, tmp_path: P
 def test_selected_keypoints_alone_are_scored_and_reconstructed(images: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[int] = []
     reconstruct = Sketch.reconstruct
-    monkeypatch.setattr(Sketch, "reconstruct", lambda self, view, rng: seen.append(len(view.release)) or reconstruct(self, view, rng))
+    monkeypatch.setattr(
+        Sketch, "reconstruct", lambda self, view, rng: seen.append(len(view.release)) or reconstruct(self, view, rng)
+    )
     found = run([Undefended()], [Glimpse()], images)
     assert [record["metrics"]["l2"] for record in found] == [0, 0]
     assert seen == [-(-record["metrics"]["keypoints"] // 2) for record in found]

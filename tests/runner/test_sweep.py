@@ -85,7 +85,8 @@ def read_records(out: Path) -> list[Record]:
 def select_engine_independent(records: list[Record]) -> list[Any]:
     """Return the records without the keys that depend on the engine."""
     return [
-        {key: value for key, value in record.items() if key not in ("seconds", "environment", "run_hash", "digest")} for record in records
+        {key: value for key, value in record.items() if key not in ("seconds", "environment", "run_hash", "digest")}
+        for record in records
     ]
 
 
