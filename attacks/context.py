@@ -41,7 +41,7 @@ class Context(DescriptorAttack):
         return reason and f"no adapted attacker: {self._path().name} was {reason}"
 
     def assets(self, defense: Defense, extractor: Extractor, public: Public) -> Mapping[str, str]:
-        return {"weights": self._network().digest}
+        return {"weights": self._network().verify()}
 
     def recover(self, view: View, rng: np.random.Generator) -> Floats:
         import torch

@@ -38,7 +38,7 @@ class DIA(ImageAttack):
         return _choose(self.weights, defense, extractor, public)[1]
 
     def assets(self, defense: Defense, extractor: Extractor, public: Public) -> Mapping[str, str]:
-        return {"weights": self._network(defense, extractor, public).digest}
+        return {"weights": self._network(defense, extractor, public).verify()}
 
     def reconstruct(self, view: View, rng: np.random.Generator) -> Floats:
         from bench.inversion.encoding import encode_settings

@@ -37,7 +37,7 @@ class Keypoints(ImageAttack):
         return explain_other_features(network.meta, extractor, public)
 
     def assets(self, defense: Defense, extractor: Extractor, public: Public) -> Mapping[str, str]:
-        return {"weights": self._network().digest}
+        return {"weights": self._network().verify()}
 
     def reconstruct(self, view: View, rng: np.random.Generator) -> Floats:
         from bench.inversion.reconstruct import reconstruct_image

@@ -49,6 +49,17 @@ class Network:
             raise UserError(f"{self.path}: tensors do not match the metadata: {error}") from error
         return module.eval().to(pick_device())
 
+    def verify(self) -> str:
+        """Compare the tensors with the metadata, and return the digest.
+
+        Raises
+        ------
+        UserError
+            if they do not match.
+        """
+        _ = self.module
+        return self.digest
+
 
 def save(path: Path, module: ContextModel, meta: dict[str, Any]) -> str:
     """Write the weights in half precision, where they fit into it, and return the file's digest."""

@@ -68,6 +68,17 @@ class Network:
         module.eval().to(pick_device(), memory_format=torch.channels_last)  # type: ignore[call-overload]
         return module
 
+    def verify(self) -> str:
+        """Compare the tensors with the metadata, and return the digest.
+
+        Raises
+        ------
+        UserError
+            if they do not match.
+        """
+        _ = self.module
+        return self.digest
+
     @property
     def supported_settings(self) -> dict[str, Between | OneOf]:
         return {field: _decode_setting(text) for field, text in self.meta["serves"].items()}

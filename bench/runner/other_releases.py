@@ -80,7 +80,7 @@ def random_window(source: Source, rng: np.random.Generator) -> Bytes:
 
     Raises
     ------
-    UnitError
+    SampleError
         if the photograph cannot be read.
     """
     image = _shrunk(source)

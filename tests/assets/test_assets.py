@@ -33,6 +33,7 @@ def test_all_together_stay_under_95_megabytes():
     assert sum(path.stat().st_size for path in ASSETS.iterdir()) < 95e6
 
 
+@pytest.mark.slow
 def test_dictionaries(public):
     k, z = public.dictionary("shipped"), public.dictionary("shipped-public")
     assert (len(k), len(z)) == (256_000, 128_000)
@@ -76,6 +77,7 @@ def test_every_required_release_is_supported(public):
     assert "no adapted attacker" in (DIA().explain_not_applicable(LDP(epsilon=20), Sift(), public) or "")
 
 
+@pytest.mark.slow
 def test_oriented_descriptors_have_an_attacker_of_their_own(public):
     """The network for upright descriptors reconstructs them far worse, and is not used (control)."""
     oriented = Sift(upright=False)
@@ -92,6 +94,7 @@ def test_oriented_descriptors_have_an_attacker_of_their_own(public):
     assert np.mean(adapted) > np.mean(mismatched) + 0.1
 
 
+@pytest.mark.slow
 def test_the_main_run_is_reproducible_bit_for_bit():
     image = [photographs.list_builtin()[0].path]
     once, again, other = (bench.run([LDP()], [DIA()], image, seed=seed) for seed in (5, 5, 6))
@@ -112,6 +115,7 @@ def assert_ordered(table: pd.DataFrame) -> None:
     assert raw > weak > strong, f"SSIM: raw {raw:.4f}, ε = 16 {weak:.4f}, ε = 10 {strong:.4f}"
 
 
+@pytest.mark.slow
 def test_order_on_the_built_in_photographs():
     table = measure_ssim(None)
     assert len(table) == 7

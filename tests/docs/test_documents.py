@@ -136,7 +136,8 @@ def list_anchors(path: Path) -> set[str]:
     """Return the fragments of a page's headings, as GitHub makes them."""
     text = re.sub(r"^```.*?^```", "", path.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
     slugs = [re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in re.findall(r"^#+ (.+)$", text, re.MULTILINE)]
-    return {slug if not slugs[:number].count(slug) else f"{slug}-{slugs[:number].count(slug)}" for number, slug in enumerate(slugs)}
+    earlier = [slugs[:number].count(slug) for number, slug in enumerate(slugs)]
+    return {f"{slug}-{count}" if count else slug for slug, count in zip(slugs, earlier, strict=True)}
 
 
 def list_broken_links(path: Path) -> list[str]:

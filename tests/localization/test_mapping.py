@@ -47,6 +47,7 @@ def scene_map(references: Views) -> Map:
     return mapping.build_map(*references)
 
 
+@pytest.mark.slow
 def test_points_lie_where_they_were_rendered(scene_map: Map, references: Views) -> None:
     assert len(scene_map.xyz) > 300
     off, foreground = [], []

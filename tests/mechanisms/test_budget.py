@@ -26,6 +26,7 @@ def test_descriptors_compose_to_the_budget() -> None:
     assert divide_budget(8000.0, 800, 1, 256_000).epsilon == pytest.approx(10.0, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_yields_are_those_of_the_mechanism() -> None:
     plan = divide_budget(8000.0, 800, 1, 1000)
     assert [row.size for row in compute_yields(plan)] == [1, 2, 4]  # at ε = 10 and 1000 words, one is the best size

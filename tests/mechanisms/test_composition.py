@@ -67,6 +67,7 @@ def test_against_sixty_digits(epsilon: float, answers: int) -> None:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("epsilon", "answers"), [(1.0, 50), (0.5, 200), (0.02, 3000)])
 def test_against_googles_accountant(epsilon: float, answers: int) -> None:
     """For randomised responses. The accountant rounds each loss up to a multiple of a step."""

@@ -77,6 +77,7 @@ def measure_frequencies(defense: Defense, secrets: Features, public: Public, dra
     return np.array(found)
 
 
+@pytest.mark.slow
 def test_exponential_has_the_law_of_its_docstring(tmp_path: Path) -> None:
     public, asset = Public(), write_dictionary(tmp_path, 12)
     defense = Exponential(epsilon=6.0, floor=0.3, levels=5, dictionary=asset)
@@ -90,6 +91,7 @@ def test_exponential_has_the_law_of_its_docstring(tmp_path: Path) -> None:
     assert defense.privacy(public).epsilon == 6.0
 
 
+@pytest.mark.slow
 def test_metric_ldp_has_the_law_of_its_docstring(tmp_path: Path) -> None:
     public, asset = Public(), write_dictionary(tmp_path, 12)
     defense = MetricLDP(epsilon=5.0, steps=4, dictionary=asset)
@@ -116,6 +118,7 @@ def test_a_guarantee_by_distance_is_no_epsilon(tmp_path: Path) -> None:
     assert Exponential(dictionary=write_dictionary(tmp_path)).distance(draw_features(2), Public(), 0, 1) == 1
 
 
+@pytest.mark.slow
 def test_a_guarantee_by_distance_is_in_no_epsilon_column(tmp_path: Path) -> None:
     """Neither in records, nor in tables, nor in a leaderboard's sheets, nor among budgets; and the records are of the schema."""
     small = write_dictionary(tmp_path)
@@ -145,6 +148,7 @@ def test_a_guarantee_by_distance_is_in_no_epsilon_column(tmp_path: Path) -> None
 # ---- the audit
 
 
+@pytest.mark.slow
 def test_guarantees_hold(tmp_path: Path) -> None:
     for defense in (Exponential(epsilon=2.0, floor=0.2), MetricLDP(epsilon=3.0), Exponential(epsilon=4.0, subset_size=3)):
         found = audit(defense, 64, 4000, 0, tmp_path)
@@ -153,6 +157,7 @@ def test_guarantees_hold(tmp_path: Path) -> None:
     assert found.strongest.epsilon < 1
 
 
+@pytest.mark.slow
 def test_exponential_uses_about_half_of_its_epsilon(tmp_path: Path) -> None:
     found = audit(Exponential(epsilon=Exact("1/3"), floor=0.3), 3, 400, 0, tmp_path).enumeration
     assert found is not None
@@ -160,6 +165,7 @@ def test_exponential_uses_about_half_of_its_epsilon(tmp_path: Path) -> None:
     assert 1 / 6 < found.low <= found.high < 1 / 5
 
 
+@pytest.mark.slow
 def test_enumeration_of_a_guarantee_by_distance(tmp_path: Path) -> None:
     found = audit(MetricLDP(epsilon=2.0), 3, 400, 0, tmp_path).enumeration
     assert found is not None
@@ -187,6 +193,7 @@ class Rescaled(MetricLDP):
         return sound.protect(secret, public, rng)
 
 
+@pytest.mark.slow
 def test_broken_variants_are_detected(tmp_path: Path) -> None:
     found = audit(WithoutTheTwo(epsilon=Exact("1/3"), floor=0.3), 3, 400, 0, tmp_path)
     assert found.enumeration is not None

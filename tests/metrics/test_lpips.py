@@ -64,6 +64,7 @@ def by_definition(weights: Path, truth: np.ndarray, estimate: np.ndarray) -> flo
     return total
 
 
+@pytest.mark.slow
 def test_formula_of_the_paper(weights: Path, images: tuple[np.ndarray, np.ndarray]) -> None:
     found = LPIPS(weights=weights)(*images)
     assert found == pytest.approx(by_definition(weights, *images), rel=1e-4)
@@ -94,6 +95,7 @@ def test_its_settings_are_the_weights_by_content(weights: Path, tmp_path: Path) 
     assert "ssim" in settings
 
 
+@pytest.mark.slow
 def test_other_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="absent: no such file"):
         LPIPS(weights=tmp_path / "absent")
@@ -106,6 +108,7 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
         LPIPS(weights=wrong)
 
 
+@pytest.mark.slow
 def test_it_is_measured_only_on_request(
     weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

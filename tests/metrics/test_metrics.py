@@ -34,6 +34,7 @@ def normalize_rows(rows: np.ndarray) -> np.ndarray:
 # ---- images
 
 
+@pytest.mark.slow
 def test_image_errors_equal_scikit_image(images: tuple[np.ndarray, np.ndarray]) -> None:
     truth, estimate = images
     exact = truth.astype(np.float64), estimate.astype(np.float64)
@@ -189,6 +190,7 @@ def test_a_photograph_without_a_face_has_no_value(portrait: np.ndarray) -> None:
         assert face.PLUGIN()(ground, portrait) is None
 
 
+@pytest.mark.slow
 def test_of_two_faces_one_may_be_found(portrait: np.ndarray) -> None:
     beside = np.concatenate([portrait, portrait], axis=1)
     covered = beside.copy()
