@@ -70,7 +70,7 @@ TEXT = {
 ALLOWED: dict[tuple[str, str], str] = {
     (r".*", r"unit_rows|unit_integer_points|unit_vertices|UNIT"): "vectors of unit norm",
     (r"bench/(api|audit/|datasets/|images/|registry/).*|(leaderboard|metrics|tests|tools)/.*", r"unit"): "units of measure",
-    (r"bench/inversion/network\.py|tests/inversion/.*", r"paint|painted"): "names of tensors and metadata in the shipped networks",
+    (r"bench/inversion/network\.py|tests/inversion/.*", r"paint|painted"): "names of tensors and metadata in shipped networks",
     (r"defenses/privunit\.py|tests/.*|docs/.*", r"PrivUnit"): "the name of a mechanism",
     (r"bench/rendering/.*", r"legs?|board"): "parts of people and furniture",
     (r"(bench/inversion|bench/rendering|tests|tools)/.*", r"cells?|CELL"): "grid cells",

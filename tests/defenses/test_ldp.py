@@ -98,7 +98,7 @@ def test_digits_of_p_against_rational_arithmetic(epsilon: float, domain: int, si
 @given(
     epsilon=st.floats(0, 20, allow_subnormal=False).filter(lambda e: e == 0 or e > 1e-6),
     domain=st.integers(2, 10**6),
-    share=st.floats(0, 1),
+    fraction=st.floats(0, 1),
 )
 def test_digits_of_p_against_rational_arithmetic_anywhere(epsilon: float, domain: int, fraction: float) -> None:
     size = max(1, round(fraction * domain))

@@ -65,10 +65,10 @@ def test_points_are_drawn_where_pycolmap_projects_them(dots) -> None:
     plane = create_quad(texture, (-1.1, -0.9, 2.7), (2.0, 0.1, 0.7), (0.0, 1.7, 0.2))
     image = render(camera, plane).light[..., 0]
     points = plane.corner + centres @ np.stack([plane.across, plane.down])
-    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", FOCAL, *SIZE)
+    intrinsics = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", FOCAL, *SIZE)
 
     def project(pose: pycolmap.Rigid3d) -> np.ndarray:
-        return np.array([camera.img_from_cam(pose * point) for point in points])
+        return np.array([intrinsics.img_from_cam(pose * point) for point in points])
 
     exact = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), camera.translation)
     assert measure_offset(image, project(exact)) < 0.12  # perspective moves a disc's centroid a little
@@ -164,6 +164,6 @@ def test_foreground_is_where_it_is_solid_and_not_hidden() -> None:
 def test_sky_is_evaluated_in_the_direction_of_each_pixel() -> None:
     rotation = Rotation.from_euler("y", 30, degrees=True).as_matrix()
     light = draw(create_camera(rotation), (), (), lambda rays: rays).light
-    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", FOCAL, *SIZE)
+    intrinsics = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", FOCAL, *SIZE)
     ray = np.append(camera.cam_from_img(np.array([100.5, 30.5])), 1)
     np.testing.assert_allclose(light[30, 100], rotation.T @ ray / np.linalg.norm(ray), atol=1e-4)

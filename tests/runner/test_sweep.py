@@ -296,7 +296,7 @@ def test_status_from_start_to_end(plan: Plan, tmp_path: Path) -> None:
     running: Iterator[Record] = execute.execute([plan], out)
     next(running)  # the pair that does not apply
     first = read_status(out)
-    assert (first.count, first.explain_not_applicable, first.alive) == (Count(missing=9), 1, True)
+    assert (first.count, first.inapplicable, first.alive) == (Count(missing=9), 1, True)
     next(running)
     next(running)
     middle = read_status(out)
@@ -316,7 +316,8 @@ def test_samples_in_progress_are_running_until_their_process_is_killed(plan: Pla
 import sys, time
 from pathlib import Path
 from fake_plugins.sketch import Sketch
-from bench import runner
+from fakes import prepare_plan
+from bench.runner import execute
 from bench.tasks.reconstruction import Reconstruction
 from defenses.none import Undefended
 

@@ -1,0 +1,51 @@
+"""Releases and scores are those of the golden record, on the machine that wrote it."""
+
+import copy
+from pathlib import Path
+
+import golden_record
+import pytest
+
+RECORD = Path(__file__).parent / "data" / "golden.jsonl"
+CASES = list(golden_record.cases())
+QUICK = 4  # image pairs, three defenses
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _same_machine() -> None:
+    machine = golden_record.read(RECORD)[0]
+    if machine != golden_record.describe_machine():
+        pytest.skip(f"the golden record was written on another machine: {machine}")
+
+
+def find_differences(*numbers: int) -> list[str]:
+    with golden_record.constant_sources():
+        lines = list(golden_record.measure_all([CASES[number] for number in numbers]))
+    return list(golden_record.find_differences(golden_record.read(RECORD)[1], lines))
+
+
+@pytest.mark.slow
+def test_releases_and_scores_of_image_pairs() -> None:
+    assert find_differences(QUICK) == []
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("number", [number for number in range(len(CASES)) if number != QUICK])
+def test_releases_and_scores(number: int) -> None:
+    assert find_differences(number) == []
+
+
+@pytest.mark.parametrize("part", ["releases", "metrics"])
+def test_a_difference_is_found(part: str) -> None:
+    """Negative control."""
+    before = golden_record.read(RECORD)[1]
+    after = copy.deepcopy(before)
+    changed = next(line for line in after if line.get("metrics"))
+    if part == "releases":
+        changed["releases"][0] = changed["releases"][0][::-1]
+    else:
+        name = next(name for name, value in changed["metrics"].items() if isinstance(value, float) and value)
+        changed["metrics"][name] *= 1 + 1e-5
+    assert list(golden_record.find_differences(before, before)) == []
+    (message,) = golden_record.find_differences(before, after)
+    assert part in message
