@@ -164,6 +164,6 @@ def test_foreground_is_where_it_is_solid_and_not_hidden() -> None:
 def test_sky_is_evaluated_in_the_direction_of_each_pixel() -> None:
     rotation = Rotation.from_euler("y", 30, degrees=True).as_matrix()
     light = draw(create_camera(rotation), (), (), lambda rays: rays).light
-    intrinsics = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", FOCAL, *SIZE)
+    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", FOCAL, *SIZE)
     ray = np.append(camera.cam_from_img(np.array([100.5, 30.5])), 1)
     np.testing.assert_allclose(light[30, 100], rotation.T @ ray / np.linalg.norm(ray), atol=1e-4)
