@@ -124,6 +124,7 @@ def test_order_on_the_built_in_photographs():
         assert_ordered(table.rename(columns={10.0: 16.0, 16.0: 10.0}))
 
 
+@pytest.mark.exhaustive
 def test_order_on_the_test_photographs(shared_data):
     names = (shared_data / "test.txt").read_text().split()
     table = measure_ssim([shared_data / "train" / name for name in names])

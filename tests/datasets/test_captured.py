@@ -52,6 +52,7 @@ def centres(images: list[SceneImage]) -> np.ndarray:
     return np.array([image.cam_from_world.inverse().translation for image in images])
 
 
+@pytest.mark.slow
 def test_structure_from_motion_recovers_the_gallery_s_cameras(dataset: Captured, truth: list[SceneImage]) -> None:
     scene = dataset.scene()
     assert scene.excluded_images == ()

@@ -76,6 +76,7 @@ def mark_long(names: list[str]) -> list[Any]:
     return [pytest.param(name, marks=pytest.mark.exhaustive if name in LONG else pytest.mark.slow) for name in names]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", mark_long(TABLES))
 def test_smoke(name: str, images: Path, out: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert reproduce(name, images, out) == 0
@@ -134,6 +135,7 @@ def test_shipped_files_support_every_row() -> None:
     assert len(find_unsupported_rows(replace(setting, materials=another))) == 16
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", mark_long(["figures", "figure-inlier"]))
 def test_figures(name: str, images: Path, out: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert reproduce(name, images, out) == 0

@@ -253,6 +253,7 @@ def test_two_workers_one_of_them_killed(images: Path, small: Asset, tmp_path: Pa
     assert len(read_records(tmp_path / "many")) == len(keys) + sum(record["status"] == "failed" for record in again)
 
 
+@pytest.mark.slow
 def test_an_attack_that_kills_every_worker_is_a_failed_record(images: Path, tmp_path: Path, cluster: Any) -> None:
     engine = engines.choose_engine(kind="dask", scheduler=cluster.scheduler_address)
     part = grid(defenses=[Undefended()], attacks=[Fatal(), Sketch()], tasks=[RECONSTRUCTION], images=[images / "0.png"])[0]
@@ -262,6 +263,7 @@ def test_an_attack_that_kills_every_worker_is_a_failed_record(images: Path, tmp_
     assert "every worker that began this ended" in fatal["reason"]
 
 
+@pytest.mark.slow
 def test_a_worker_with_other_files_is_refused(images: Path, tmp_path: Path, cluster: Any) -> None:
     """It would make other records."""
     engine = engines.choose_engine(kind="dask", scheduler=cluster.scheduler_address)
