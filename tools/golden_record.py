@@ -146,7 +146,7 @@ def plan_case(case: Case) -> Plan:
 
 def arrays(release: Release) -> dict[str, np.ndarray]:
     """Return all arrays of a release, by names that do not depend on its class."""
-    content = {"keypoints": release.keypoints, "size": np.array(release.size, np.int64)}
+    content: dict[str, np.ndarray] = {"keypoints": release.keypoints, "size": np.array(release.size, np.int64)}
     for name in ("descriptors", "frames", "origins", "bases", "candidates", "words"):
         if (value := getattr(release, name, None)) is not None:
             content[name] = value

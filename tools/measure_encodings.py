@@ -134,9 +134,11 @@ def compare_encodings(study: Study) -> str:
     results: dict[Label, Scores] = {}
     for name, defense, defenses in (("affine", "affine", SUBSPACES), ("ldp", "ldp:words=0", WORD_SETS)):
         for encoding in ("released", "invariant"):
-            words = ["--defense", defense, "--encoding", encoding, "--initial-checkpoint", initial]
-            words += ["--steps", FURTHER, "--rate", 1e-3]
-            network = study.train_network(f"{name}-{encoding}", *words)
+            network = study.train_network(
+                f"{name}-{encoding}",
+                *("--defense", defense, "--encoding", encoding, "--initial-checkpoint", initial),
+                *("--steps", FURTHER, "--rate", 1e-3),
+            )
             results |= {
                 (defense, encoding): one for defense, one in zip(defenses, study.measure_scores(network, defenses), strict=True)
             }

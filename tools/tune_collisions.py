@@ -72,7 +72,7 @@ def measure_photographs(
         lifted = defense.lift(secret, public, np.random.default_rng([SEED, dim, number]))
         knowledge: dict[type[Knowledge], Callable[[], Any]] = {
             PublicDatabase: lambda: PublicDatabase(words=public.dictionary(attack.database).words),
-            OtherReleases: lambda name=source.name: OtherReleases(draw=pool.without(name)),
+            OtherReleases: partial(OtherReleases, draw=pool.without(source.name)),
         }
         view = View(release=lifted.release, defense=defense, extractor=extractor, knowledge=knowledge)
         estimate = attack.recover(view, np.random.default_rng(SEED))

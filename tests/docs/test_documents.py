@@ -109,6 +109,8 @@ def build_arguments(command: str) -> list[str]:
     if command.startswith("dataset gallery"):
         smaller, *more = shlex.split(SMALLER[command])
         return [smaller if word == "gallery" else word for word in words] + more
+    if command.startswith("run --task structure"):  # the references of the small walk have few descriptors
+        words = [word.replace("words=256000", "words=2560") for word in words]
     if command.startswith("submit-check"):
         return [*words, "--images", "photos/"]
     return [*words, *shlex.split((SMALLER | LONG).get(command, ""))]
