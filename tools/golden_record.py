@@ -16,6 +16,8 @@ import dataclasses
 import hashlib
 import json
 import math
+import os
+import platform
 import sys
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
@@ -26,7 +28,7 @@ from unittest import mock
 import numpy as np
 
 from bench.cache import provenance, store
-from bench.core import environment
+from bench.core import environment, hashing
 from bench.core.errors import SampleError
 from bench.datasets import gallery
 from bench.images import photographs
@@ -198,8 +200,13 @@ def constant_sources() -> Iterator[None]:
 
 
 def describe_machine() -> dict[str, Any]:
-    """Return what numbers may depend on beside our own source."""
-    return environment.describe_platform() | {"threads": 0}
+    """Return what numbers may depend on beside our own source: libraries, and the processor by which they choose their kernels."""
+    cpuinfo = Path("/proc/cpuinfo")
+    processor = cpuinfo.read_text(encoding="utf-8").partition("\n\n")[0] if cpuinfo.is_file() else platform.processor()
+    names = ("vendor_id", "cpu family", "model", "model name", "flags")
+    lines = [line for line in processor.splitlines() if line.partition("\t")[0].strip() in names] or [processor]
+    kernels = {name: os.environ.get(name) for name in ("OPENBLAS_CORETYPE", "MKL_ENABLE_INSTRUCTIONS")}
+    return environment.describe_platform() | {"threads": 0, "processor": hashing.short_hash([lines, kernels])}
 
 
 def read(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:

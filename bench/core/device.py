@@ -33,7 +33,14 @@ def pick_dtype(device: torch.device) -> torch.dtype:
 
     if device.type == "cuda":
         return torch.bfloat16 if torch.cuda.is_bf16_supported() else torch.float32
-    if device.type == "cpu":
+    return torch.bfloat16 if device.type == "cpu" and _has_bf16_products() else torch.float32
+
+
+def _has_bf16_products() -> bool:
+    """Whether the processor has instructions for products in bf16: AMX or AVX-512."""
+    import torch
+
+    if hasattr(torch.cpu, "get_capabilities"):  # since torch 2.13
         capabilities = torch.cpu.get_capabilities()
-        return torch.bfloat16 if capabilities.get("amx_bf16") or capabilities.get("avx512_bf16") else torch.float32
-    return torch.float32
+        return bool(capabilities.get("amx_bf16") or capabilities.get("avx512_bf16"))
+    return bool(torch.cpu._is_amx_tile_supported() or torch.cpu._is_avx512_bf16_supported())
