@@ -200,7 +200,7 @@ def constant_sources() -> Iterator[None]:
 
 
 def describe_machine() -> dict[str, Any]:
-    """Return what numbers may depend on beside our own source: libraries, and the processor by which they choose their kernels."""
+    """Return what numbers may depend on beside our own source: libraries, and the processor that selects their kernels."""
     cpuinfo = Path("/proc/cpuinfo")
     processor = cpuinfo.read_text(encoding="utf-8").partition("\n\n")[0] if cpuinfo.is_file() else platform.processor()
     names = ("vendor_id", "cpu family", "model", "model name", "flags")
