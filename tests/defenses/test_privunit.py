@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy import stats
+from scipy.integrate import trapezoid
 
 from bench.audit.auditor import audit
 from bench.codebook.examples import draw_features, write_dictionary
@@ -43,8 +44,8 @@ def test_the_cap_is_the_best(epsilon: float, length: int) -> None:
 
     def mean(gamma: float) -> float:
         inside = along >= gamma
-        q = float(np.trapezoid(np.where(inside, density, 0), along))
-        return float(np.trapezoid(along * density * np.where(inside, math.exp(epsilon), 1.0), along)) / (
+        q = float(trapezoid(np.where(inside, density, 0), along))
+        return float(trapezoid(along * density * np.where(inside, math.exp(epsilon), 1.0), along)) / (
             q * math.exp(epsilon) + 1 - q
         )
 
