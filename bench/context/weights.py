@@ -12,6 +12,7 @@ import numpy as np
 
 from bench.core.errors import UserError
 from bench.formats import tensor_file
+from bench.formats.network_file import NetworkFile
 
 if TYPE_CHECKING:
     from bench.context.network import ContextModel
@@ -20,13 +21,8 @@ KIND = "surroundings-network"
 
 
 @dataclass(frozen=True, eq=False)
-class Network:
+class Network(NetworkFile):
     """A trained network, ready for inference."""
-
-    path: Path
-    arrays: tensor_file.Arrays
-    meta: dict[str, Any]
-    digest: str
 
     @cached_property
     def module(self) -> ContextModel:
@@ -48,17 +44,6 @@ class Network:
         except RuntimeError as error:
             raise UserError(f"{self.path}: tensors do not match the metadata: {error}") from error
         return module.eval().to(pick_device())
-
-    def verify(self) -> str:
-        """Compare the tensors with the metadata, and return the digest.
-
-        Raises
-        ------
-        UserError
-            if they do not match.
-        """
-        _ = self.module
-        return self.digest
 
 
 def save(path: Path, module: ContextModel, meta: dict[str, Any]) -> str:

@@ -14,6 +14,7 @@ from bench.api import Defense, Extractor
 from bench.codebook.public import Public
 from bench.core.errors import UserError
 from bench.formats import tensor_file
+from bench.formats.network_file import NetworkFile
 from bench.registry import fields, spec
 from bench.settings import Between, OneOf
 
@@ -35,13 +36,8 @@ STAGE_METADATA = ("start", "crops", "batch", "photographs", "rate", "symmetries"
 
 
 @dataclass(frozen=True, eq=False)
-class Network:
+class Network(NetworkFile):
     """A trained network, ready for inference."""
-
-    path: Path
-    arrays: tensor_file.Arrays
-    meta: dict[str, Any]
-    digest: str
 
     @cached_property
     def module(self) -> Inverter:
@@ -67,17 +63,6 @@ class Network:
             value.copy_(torch.from_numpy(self.arrays[name].astype(np.float32)))
         module.eval().to(pick_device(), memory_format=torch.channels_last)  # type: ignore[call-overload]
         return module
-
-    def verify(self) -> str:
-        """Compare the tensors with the metadata, and return the digest.
-
-        Raises
-        ------
-        UserError
-            if they do not match.
-        """
-        _ = self.module
-        return self.digest
 
     @property
     def supported_settings(self) -> dict[str, Between | OneOf]:

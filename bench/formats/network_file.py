@@ -1,0 +1,39 @@
+"""A network as it was read from a file: its tensors and metadata, from which the module is built at first use."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from bench.formats.tensor_file import Arrays
+
+if TYPE_CHECKING:
+    from torch import nn
+
+
+@dataclass(frozen=True, eq=False)
+class NetworkFile(ABC):
+    """Base class of the kinds of networks that are read from files."""
+
+    path: Path
+    arrays: Arrays
+    meta: dict[str, Any]
+    digest: str
+
+    @property
+    @abstractmethod
+    def module(self) -> nn.Module:
+        """The network itself; UserError if its tensors do not match its metadata."""
+
+    def verify(self) -> str:
+        """Compare the tensors with the metadata, and return the digest.
+
+        Raises
+        ------
+        UserError
+            if they do not match.
+        """
+        _ = self.module
+        return self.digest
