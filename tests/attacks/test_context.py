@@ -25,6 +25,7 @@ from bench.images.views import PhotographView
 from bench.inversion.plan import Training
 from bench.inversion.train import check_quantisation
 from bench.mechanisms.subset import draw_word_subsets, log10_chance
+from bench.settings import Asset
 from bench.threat_model import PublicAssets
 from bench.types import Points, WordSets
 from defenses.ldp import LDP
@@ -306,7 +307,7 @@ def test_saved_weights_give_the_same_network(trained, tmp_path):
     other.shape = trained.shape
     weights.save(path, other, {"extractor": {}})
     with pytest.raises(UserError, match="tensors do not match"):
-        _ = weights.load(path).module
+        Context(weights=Asset(path)).assets(LDP(), Sift(), Public())  # when a plan is built, before anything is written
     with pytest.raises(UserError, match="no such file"):
         weights.load(tmp_path / "none.safetensors")
 

@@ -469,7 +469,7 @@ def test_weights_of_another_network_are_refused(spoil, message, tmp_path):
     arrays, meta, _ = tensor_file.load(path, weights.KIND)
     tensor_file.save(path, weights.KIND, spoil(arrays), meta)
     with pytest.raises(UserError, match=message):
-        _ = weights.load(path).module
+        weights.load(path).verify()
 
 
 def test_weights_outside_the_range_of_half_precision_are_stored_in_single_precision(tmp_path, rng):
