@@ -9,6 +9,7 @@ exit status is returned. A bound may be lowered only if this passes.
 from __future__ import annotations
 
 import argparse
+import os
 import re
 import subprocess
 import sys
@@ -46,7 +47,8 @@ def main() -> int:
     constraints = options.venv / "oldest.txt"
     constraints.write_text("\n".join(pin_oldest(project["dependencies"])) + "\n", encoding="utf-8")
     subprocess.run([python, "-m", "pip", "install", "-q", "-c", constraints, "-e", f"{ROOT}[test]"], check=True)
-    return subprocess.run([python, "-m", "pytest", "-q", "-m", "not exhaustive and not slow"], cwd=ROOT, check=False).returncode
+    quick = [python, "-m", "pytest", "-q", "-n", "logical", "--dist", "worksteal", "-m", "not exhaustive and not slow"]
+    return subprocess.run(quick, cwd=ROOT, env=os.environ | {"OMP_NUM_THREADS": "1"}, check=False).returncode
 
 
 if __name__ == "__main__":

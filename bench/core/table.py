@@ -112,11 +112,16 @@ def to_csv(*tables: Table) -> str:
             for name, value in row.items():
                 record |= _expand(name, value) if name in intervals else {name: _exact(value)}
             records.append(record)
+    return write_csv(records)
+
+
+def write_csv(records: Sequence[Mapping[str, Any]]) -> str:
+    """Return records as CSV in full precision; n/a stands for None, NaN and a name that a record lacks."""
     out = io.StringIO()
     names = dict.fromkeys(name for record in records for name in record)
     writer = csv.DictWriter(out, list(names), restval=NOT_APPLICABLE, lineterminator="\n")
     writer.writeheader()
-    writer.writerows(records)
+    writer.writerows({name: _exact(value) for name, value in record.items()} for record in records)
     return out.getvalue()
 
 

@@ -93,7 +93,7 @@ def reproduce(
     records = (record for group in reproduced.result.records.values() for record in group)
     files = [Text(line) for line in localization_results.write(records, folder)]
     files += [] if table.draw is None else _save_figures(name, table.draw(data), folder)
-    return Reproduction(out=folder, output=(*page.to_rich(reproduced), *files), failed=run.count_failures(reproduced.result))
+    return Reproduction(out=folder, output=(*page.to_terminal(reproduced), *files), failed=run.count_failures(reproduced.result))
 
 
 def group_drawings() -> dict[str, tuple[Drawing, ...]]:

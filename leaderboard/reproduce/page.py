@@ -6,12 +6,11 @@ import json
 import math
 from collections import Counter
 from collections.abc import Container, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import pandas as pd
-
-from bench.core.table import markdown_row
+from bench.core import table as tables
 from bench.registry import spec
 from leaderboard.intervals import LEVEL, Interval
 from leaderboard.reproduce import run
@@ -43,8 +42,8 @@ def write(table: ReproducedTable, out: Path) -> list[Path]:
     name = table.definition.name
     texts = {
         f"{name}.md": to_markdown(table),
-        f"{name}.csv": tabulate_values(table).to_csv(index=False, lineterminator="\n"),
-        f"{name}-claims.csv": tabulate_statements(table).to_csv(index=False, lineterminator="\n"),
+        f"{name}.csv": tables.write_csv(tabulate_values(table)),
+        f"{name}-claims.csv": tables.write_csv(tabulate_statements(table)),
         f"{name}.json": json.dumps(to_json(table), indent=1, ensure_ascii=False, allow_nan=False) + "\n",
     }
     for file, text in texts.items():
@@ -65,16 +64,11 @@ def format_heading(table: ReproducedTable) -> str:
 
 def to_markdown(table: ReproducedTable) -> str:
     """Return the whole report."""
-    values = compare_values(table)
+    values = replace(compare_values(table), heading="")
     lines = [
         f"# {format_heading(table)}",
         "",
-        markdown_row(values.columns),
-        markdown_row("---" for _ in values.columns),
-        *(markdown_row(row) for row in values.itertuples(index=False)),
-        "",
-        *(f"- {line}" for line in list_remarks(table)),
-        "",
+        tables.to_markdown(values, plain=True),
         "## Claims of the paper",
         "",
     ]
@@ -85,71 +79,60 @@ def to_markdown(table: ReproducedTable) -> str:
     return "\n".join(lines)
 
 
-def to_rich(table: ReproducedTable) -> Iterator[RichTable]:
+def to_terminal(table: ReproducedTable) -> Iterator[RichTable]:
     """Yield two tables for a terminal: the values and the claims."""
-    from rich.table import Table as RichTable
-    from rich.text import Text
-
-    values = compare_values(table)
-    value_table = RichTable(
-        title=Text(format_heading(table)),
-        caption=Text("\n".join(list_remarks(table))),
-        title_justify="left",
-        caption_justify="left",
-    )
-    for column in values.columns:
-        value_table.add_column(column, overflow="fold", justify="left" if column in ("attack", "note") else "right")
-    for row in values.itertuples(index=False):
-        value_table.add_row(*map(Text, row))
-    yield value_table
-    claims = RichTable(title=Text("Claims of the paper"), title_justify="left")
-    for column in ("verdict", "claim", "evidence"):
-        claims.add_column(column, overflow="fold")
+    yield tables.to_terminal(compare_values(table))
+    labels = ("verdict", "claim", "evidence")
+    rows = []
     for result in table.claim_results:
         lines = list_statements(result)
         more = [f"and {len(lines) - TERMINAL_LIMIT} more, in {table.definition.name}.md"] if len(lines) > TERMINAL_LIMIT else []
         evidence = "\n".join([count_verdicts(result), *lines[:TERMINAL_LIMIT], *more])
-        claims.add_row(Text(result.verdict.value), Text(result.claim.text), Text(evidence))
-    yield claims
+        rows.append((result.verdict.value, result.claim.text, evidence))
+    yield tables.to_terminal(tables.build_table(labels, rows, text=labels, heading="Claims of the paper"))
 
 
-def compare_values(table: ReproducedTable) -> pd.DataFrame:
+def compare_values(table: ReproducedTable) -> tables.Table:
     """Return the paper's values and ours as text, one line per row; reference rows come last."""
     printed = {measure for row in table.result.rows for measure in row.paper}
     rows = [_format_row(row, table, printed) for row in table.result.rows]
-    frame = pd.DataFrame(rows).fillna("")
-    frame["note"] = [table.notes[row.name] for row in table.result.rows]
-    return frame if frame["note"].any() else frame.drop(columns="note")
+    labels = list(dict.fromkeys(label for row in rows for label in row))
+    if any(table.notes.values()):
+        labels.append("note")
+        rows = [values | {"note": table.notes[row.name]} for values, row in zip(rows, table.result.rows, strict=True)]
+    return tables.build_table(
+        labels,
+        [[row.get(label, "") for label in labels] for row in rows],
+        text=("attack", "note"),
+        heading=format_heading(table),
+        remarks=list_remarks(table),
+    )
 
 
-def tabulate_values(table: ReproducedTable) -> pd.DataFrame:
+def tabulate_values(table: ReproducedTable) -> list[dict[str, Any]]:
     """Return one line per entry: the paper's value and ours in full precision."""
-    return pd.DataFrame(
-        [
-            {
-                "row": row.name,
-                **row.labels,
-                "measure": measure,
-                "paper": row.paper.get(measure),
-                **_interval_to_json(table.ours.get((row.name, measure))),
-                "experiment_id": " ".join(table.result.experiment_ids[row.name]),
-                "note": table.notes[row.name],
-            }
-            for row in table.result.rows
-            for measure in table.definition.measures
-        ]
-    )
+    return [
+        {
+            "row": row.name,
+            **row.labels,
+            "measure": measure,
+            "paper": row.paper.get(measure),
+            **_interval_to_json(table.ours.get((row.name, measure))),
+            "experiment_id": " ".join(table.result.experiment_ids[row.name]),
+            "note": table.notes[row.name],
+        }
+        for row in table.result.rows
+        for measure in table.definition.measures
+    ]
 
 
-def tabulate_statements(table: ReproducedTable) -> pd.DataFrame:
+def tabulate_statements(table: ReproducedTable) -> list[dict[str, Any]]:
     """Return one line per statement of each claim, with its evidence."""
-    return pd.DataFrame(
-        [
-            {"claim": result.claim.text, "claim_verdict": result.verdict.value, **_evidence_to_json(evidence)}
-            for result in table.claim_results
-            for evidence in result.evidence
-        ]
-    )
+    return [
+        {"claim": result.claim.text, "claim_verdict": result.verdict.value, **_evidence_to_json(evidence)}
+        for result in table.claim_results
+        for evidence in result.evidence
+    ]
 
 
 def to_json(table: ReproducedTable) -> dict[str, Any]:

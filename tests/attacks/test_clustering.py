@@ -66,6 +66,7 @@ def test_clustering_is_at_chance_if_no_release_shares_a_word(private, public_wor
     assert 0.1 < np.mean(alone) < 0.6  # one of three
 
 
+@pytest.mark.slow
 def test_intersection_needs_other_releases(private, tmp_path):
     with_others = attack_succeeds(Intersection(neighbours=50, coverage=1.0), private, release_others(private))
     of_another = attack_succeeds(

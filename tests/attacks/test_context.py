@@ -31,6 +31,8 @@ from bench.types import Points, WordSets
 from defenses.ldp import LDP
 from defenses.naive_ldp import NaiveLDP
 
+pytestmark = pytest.mark.slow
+
 # ---- belief propagation
 
 

@@ -152,6 +152,7 @@ def reference(case: Case, words: np.ndarray, neighbours: int, estimators: int) -
     return np.array(estimates)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("dim", "neighbours", "estimators"), [(2, 10, 3), (6, 20, 1), (16, 5, 5), (4, 5000, 2)])
 def test_agrees_with_the_paper_step_by_step(rng, dim, neighbours, estimators):
     d, words = draw_related(rng, 12)

@@ -148,6 +148,7 @@ def test_less_knowledge_does_not_help(plugin, database, secret):
     assert gain.low <= 0, f"{attack.name()} is better with less knowledge, by {gain}"
 
 
+@pytest.mark.slow
 def test_a_gain_by_less_knowledge_would_be_detected(database, secret):
     """Negative control: with the two exchanged, the interval does not contain zero."""
     with_all, with_less = compare_knowledge(

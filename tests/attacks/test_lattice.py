@@ -95,6 +95,7 @@ def test_candidates_are_the_descriptor_and_the_words(tmp_path: Path, lifting, di
         assert keypoint in mine
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("lifting", "dim"), [("hybrid", 2), ("hybrid", 16), ("adversarial", 6), ("random", 16)])
 def test_with_a_database_of_centres_all_descriptors_are_found(tmp_path: Path, rng, lifting, dim):
     secret = extract_sift(30)

@@ -77,6 +77,7 @@ def solve_linear_programs(origin: np.ndarray, basis: np.ndarray, rng: np.random.
     return None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dim", [2, 6])
 def test_agrees_with_highs(rng, dim):
     secrets = draw_sparse(rng, 5, 60, zeros=26)
@@ -155,6 +156,7 @@ def test_control_a_descriptor_without_zeros_is_not_certified(tmp_path: Path, rng
     assert np.array_equal(Sparsity().recover(create_view(release), rng), guess_descriptors(release))
 
 
+@pytest.mark.slow
 def test_control_an_origin_of_another_subspace_is_not_certified(tmp_path: Path, rng):
     release = lift_features(extract_sift(60), tmp_path, draw_centres(640), dim=2)
     astray = Subspaces(
@@ -166,6 +168,7 @@ def test_control_an_origin_of_another_subspace_is_not_certified(tmp_path: Path, 
     assert len(Sparsity().find_candidates(astray, rng)[0]) == 0
 
 
+@pytest.mark.slow
 def test_control_noise_in_the_descriptor_hides_its_zeros(tmp_path: Path, rng):
     secret = extract_sift(60)
     noisy = np.abs(secret.descriptors + rng.normal(0, 1e-3, secret.descriptors.shape)).astype(np.float32)

@@ -152,6 +152,7 @@ def test_key_depends_on_everything_that_an_attack_sees(images: Path, tmp_path: P
     assert calls(defense, Guess(), [images / "1.png", images / "0.png"]) == 2  # and in another order
 
 
+@pytest.mark.slow
 def test_cached_seconds_are_those_of_the_attack(images: Path, small: Asset, monkeypatch: pytest.MonkeyPatch) -> None:
     recover = Guess.recover
 

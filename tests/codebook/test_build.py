@@ -46,6 +46,7 @@ def test_the_same_seed_gives_the_same_file(dictionary_file, album, tmp_path):
     assert again.digest == dictionary_file.digest != other.digest
 
 
+@pytest.mark.slow
 def test_words_are_in_random_order(dictionary_file):
     """Adjacent words in the file are as distant as any two words."""
     rows = unit_rows(dictionary_file.words)

@@ -17,6 +17,8 @@ from bench.datasets.captured import Captured
 from bench.datasets.gallery import Gallery
 from bench.images.scene import SceneImage
 
+pytestmark = pytest.mark.slow
+
 WALK = Gallery(views=150, rooms=1, people=0.0, width=400, height=300, detail=0.5)
 FIRST, COUNT = 84, 9
 

@@ -30,6 +30,7 @@ def scene() -> Scene:
     return SMALL.scene()
 
 
+@pytest.mark.slow
 def test_scene_follows_the_fields(scene: Scene) -> None:
     assert (len(scene.references), len(scene.queries), scene.unit) == (12, 6, "metre")
     assert [query.condition for query in scene.queries] == ["day"] * 4 + ["night"] * 2
@@ -64,6 +65,7 @@ def lift_to_surfaces(image: Reference, rendering: Shot, points: np.ndarray) -> n
     return (rays * rendering.depth[row, column, None]) @ pose.rotation.matrix().T + pose.translation
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("index", [3, 51])
 def test_matches_of_two_views_agree_with_the_poses(index: int) -> None:
     """SIFT matches, found without the poses, agree with the poses and depths to a pixel."""
@@ -89,6 +91,7 @@ def test_matches_of_two_views_agree_with_the_poses(index: int) -> None:
     assert error(pycolmap.Rigid3d(pycolmap.Rotation3d(), np.array([0.1, 0, 0])) * other.cam_from_world) > 2.5
 
 
+@pytest.mark.slow
 def test_same_seed_gives_same_pixels_and_another_seed_another_gallery(scene: Scene) -> None:
     source = scene.references[0].pixels
     before = source.read()
@@ -101,6 +104,7 @@ def test_same_seed_gives_same_pixels_and_another_seed_another_gallery(scene: Sce
     assert other.content_hash() != source.content_hash()
 
 
+@pytest.mark.slow
 def test_another_seed_hangs_other_pictures_and_walks_elsewhere() -> None:
     few = replace(SMALL, views=1, queries=1, width=64, height=48, detail=0.1)
     one, other = few.scene().references[0], replace(few, seed=1).scene().references[0]
@@ -108,12 +112,14 @@ def test_another_seed_hangs_other_pictures_and_walks_elsewhere() -> None:
     assert not np.allclose(one.cam_from_world.translation, other.cam_from_world.translation)
 
 
+@pytest.mark.slow
 def test_more_views_leave_the_queries_as_they_were(scene: Scene) -> None:
     more = replace(SMALL, views=20, queries=9).scene()
     for one, other in zip(scene.queries[:3], more.queries, strict=False):
         np.testing.assert_array_equal(one.cam_from_world.matrix(), other.cam_from_world.matrix())
 
 
+@pytest.mark.slow
 def test_masks_cover_the_people_and_nothing_else() -> None:
     """Without people the same camera sees the same depth, except inside the mask."""
     crowded, empty = replace(SMALL, people=4.0), replace(SMALL, people=0.0)
@@ -165,6 +171,7 @@ def measure_noise(pixels: np.ndarray) -> float:
     return float(np.quantile(residue, 0.25))
 
 
+@pytest.mark.slow
 def test_fields_make_queries_harder() -> None:
     sharp = render(replace(SMALL, blur=0.0, noise=0.0), "query", 0).pixels
     blurred = render(replace(SMALL, blur=3.0, noise=0.0), "query", 0).pixels

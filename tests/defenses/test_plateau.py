@@ -36,6 +36,7 @@ def theorem(plateau: set[int], domain: int, epsilon: float, size: int) -> dict[t
 CASES = [(7, 1, 1, 1.0), (7, 2, 2, 1.5), (6, 3, 2, 0.5), (8, 2, 4, 2.0), (5, 4, 3, 1.0), (6, 2, 5, 1.0), (7, 1, 3, 0.0)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("domain", "size", "near", "epsilon"), CASES)
 def test_sets_against_the_theorem(domain: int, size: int, near: int, epsilon: float) -> None:
     draws = 100_000
@@ -63,6 +64,7 @@ def test_the_sampler_has_the_law_of_the_theorem() -> None:
         assert expected <= found.at_most(Z) + Fraction(1, 2**120)
 
 
+@pytest.mark.slow
 def test_a_plateau_of_one_is_ldp() -> None:
     for size in (1, 2):
         laws = [

@@ -40,6 +40,7 @@ def test_commands_run(command: str, capfd: pytest.CaptureFixture[str]) -> None:
         assert "tight" in shown
 
 
+@pytest.mark.slow
 def test_python_line_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (line,) = re.findall(r"```python\n(.*?)\n```", PAGE, re.DOTALL)
     monkeypatch.chdir(tmp_path)

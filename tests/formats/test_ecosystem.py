@@ -70,6 +70,7 @@ def test_features_exported_to_hloc_are_read_again(images: Path, tmp_path: Path) 
     assert hloc_pairs.read(pairs) == {"b.png": ["street/a.png"]}
 
 
+@pytest.mark.slow
 def test_word_sets_export_all_candidates_and_subspaces_export_recovered_descriptors(
     images: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

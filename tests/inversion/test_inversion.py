@@ -370,6 +370,7 @@ def test_photographs_of_a_dictionary_quantise_to_nearly_themselves(sources, word
     check_quantisation(0.98 * unseen_error, unseen_error)
 
 
+@pytest.mark.slow
 def test_a_photograph_is_never_quantised_by_its_own_dictionary(sources, words, tmp_path):
     public = Public()
     inside, outside = sources[0].content_hash(), sources[3].content_hash()

@@ -119,6 +119,7 @@ def test_a_defense_whose_source_is_another_may_get_better(folder: Path, before: 
     assert verdicts(compare(before, after))["recovered"] == "better"
 
 
+@pytest.mark.slow
 def test_a_weaker_promise_is_worse_without_tolerance(folder: Path, before: Records) -> None:
     after = copy.deepcopy(before)
     for record in after:

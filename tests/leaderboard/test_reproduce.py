@@ -4,6 +4,7 @@ import csv
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,8 @@ from bench.api import Attack, Defense
 from bench.cache import store
 from bench.codebook.public import ASSETS, Public
 from bench.core import progress
+from bench.core.table import Table as PrintedTable
+from bench.core.table import write_csv
 from bench.extractors.sift import Sift
 from bench.registry import discovery
 from bench.runner.records import FILE, Record
@@ -263,6 +266,11 @@ def test_means_verdicts_and_correlation_from_records() -> None:
     assert (verdicts.count(Verdict.HOLDS), verdicts.count(Verdict.FAILS), verdicts.count(Verdict.OPEN)) == (2, 1, 3)
 
 
+def list_texts(table: PrintedTable) -> list[dict[str, str]]:
+    """Return the texts of each row by the column's label."""
+    return [dict(zip((column.label for column in table.columns), row.texts, strict=True)) for row in table.rows]
+
+
 def test_failures_and_not_applicable_rows_are_in_every_output() -> None:
     ssim = {"raw": [None, *build_values(0.6, 7)], "two": build_values(0.3), "four": build_values(0.4), "none": []}
     table = reproduce_table(ssim)
@@ -272,16 +280,17 @@ def test_failures_and_not_applicable_rows_are_in_every_output() -> None:
     assert "does not hold: [two] ssim > [four] ssim: paper 0.1, ours -0.1 [-0.1, -0.1]" in markdown
     assert "cannot tell: [raw] ssim > [none] ssim: paper 0.6, nothing measured (none: n/a: no network)" in markdown
     assert "(Of 6: 2 hold, 1 do not hold, 3 cannot be decided.)" in markdown
-    values = page.compare_values(table)
-    assert list(values["n"]) == ["7", "8", "8", "0"]
-    assert values["ssim, ours"].iloc[3] == "n/a"
-    assert "0.605" in values["ssim, ours"].iloc[1] or "0.305" in values["ssim, ours"].iloc[1]
+    values = list_texts(page.compare_values(table))
+    assert [row["n"] for row in values] == ["7", "8", "8", "0"]
+    assert values[3]["ssim, ours"] == "n/a"
+    assert "0.605" in values[1]["ssim, ours"] or "0.305" in values[1]["ssim, ours"]
     report = page.to_json(table)
     assert json.loads(json.dumps(report, allow_nan=False)) == report
     assert [claim["verdict"] for claim in report["claims"]] == ["does not hold", "does not hold"]
-    frame = page.tabulate_values(table).set_index(["row", "measure"])
+    frame = pd.read_csv(StringIO(write_csv(page.tabulate_values(table)))).set_index(["row", "measure"])
     assert pd.isna(frame.loc[("none", "ssim"), "ours"])
     assert frame.loc[("two", "ssim"), "photographs"] == 8
+    assert frame.loc[("raw", "ssim"), "paper"] == 0.6
 
 
 def test_median_counts_a_sample_without_a_value_as_the_worst() -> None:
@@ -300,7 +309,7 @@ def test_median_counts_a_sample_without_a_value_as_the_worst() -> None:
     assert table.ours["raw", "mean"].mean == 1.5
     assert table.ours["raw", "mean"].count == 2
     assert table.ours["raw", "median"].mean == float("inf")
-    values = page.compare_values(table).iloc[0]
+    (values,) = list_texts(page.compare_values(table))
     assert values["median"] == "∞"
     assert values["n"] == "2/5"
     assert "seeds 0 to 5" in page.format_heading(table)

@@ -264,6 +264,7 @@ def camera_and_references(view: View, rng: np.random.Generator) -> np.ndarray:
     return np.array([served.camera.params[0], len(names), names[0].count("/")], np.float32)
 
 
+@pytest.mark.slow
 def test_the_map_comes_without_the_queries(tmp_path: Path) -> None:
     """One of which is the secret."""
     whole = write_scene(tmp_path)

@@ -172,6 +172,7 @@ def test_labels_are_read_as_their_points() -> None:
             assert np.argmin(distances) == number
 
 
+@pytest.mark.slow
 def test_plots_are_drawn_of_the_available_records(tmp_path: Path) -> None:
     records = [
         *reconstructions(NONE, [0.8, 0.7]),

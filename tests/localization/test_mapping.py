@@ -20,6 +20,8 @@ from bench.localization.retrieval import Bags
 from bench.mechanisms.subset import draw_word_subsets
 from bench.types import Bytes, Descriptors, Features, Points, WordSets
 
+pytestmark = pytest.mark.slow
+
 TRIALS = 3000
 
 Views = tuple[list[Reference], list[Features]]

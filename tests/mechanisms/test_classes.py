@@ -41,6 +41,7 @@ def compute_reference_edges(counts: list[int], powers: list[Fraction], bits: int
     return found
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(
     counts=st.lists(st.integers(0, 10**6), min_size=2, max_size=6).filter(any),

@@ -57,6 +57,7 @@ def compute_with_sixty_digits(epsilon: float, answers: int, delta: float) -> mpm
         return best
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("epsilon", "answers"),
     [(1e-4, 10), (0.001, 3000), (0.06, 1000), (0.5, 2000), (10.0, 565), (10.0, 2000), (100.0, 30), (1000.0, 20)],

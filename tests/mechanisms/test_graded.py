@@ -48,6 +48,7 @@ def chances(weights: np.ndarray, size: int) -> dict[tuple[int, ...], float]:
     return sets
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [1, 2, 3])
 def test_words_against_enumeration(size: int) -> None:
     codes, draws = draw_features(7, 2).codes, 60_000

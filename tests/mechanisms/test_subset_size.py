@@ -88,6 +88,7 @@ def test_success_against_simulation(n: int, inclusion: float, wrong: int, trials
     assert stats.binomtest(round(fraction * runs), runs, expected).pvalue > 1e-3
 
 
+@pytest.mark.slow
 def test_control_half_of_the_model_fails() -> None:
     n, inclusion, wrong, trials, agreement, runs = 20, 0.5, 30, 25, 0.1, 1500
     hits = round(simulate_success(n, inclusion, wrong, trials, agreement, runs) * runs)

@@ -71,6 +71,7 @@ def test_formula_of_the_paper(weights: Path, images: tuple[np.ndarray, np.ndarra
     assert found > 0
 
 
+@pytest.mark.slow
 def test_contract_of_metrics(weights: Path) -> None:
     discovery.check(discovery.METRIC, LPIPS)
     testing.check_metric(LPIPS(weights=weights))

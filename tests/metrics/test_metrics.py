@@ -173,6 +173,7 @@ def portrait() -> np.ndarray:
     return (photographs.read(astronaut.path).pixels / 255).astype(np.float32)
 
 
+@pytest.mark.slow
 def test_a_face_counts_only_at_its_position(portrait: np.ndarray) -> None:
     metric = face.PLUGIN()
     assert metric(portrait, portrait.copy()) == 1.0
@@ -198,6 +199,7 @@ def test_of_two_faces_one_may_be_found(portrait: np.ndarray) -> None:
     assert face.PLUGIN()(beside, covered) == 0.5
 
 
+@pytest.mark.slow
 def test_faces_are_those_of_scikit_image(portrait: np.ndarray) -> None:
     """The detector's direct result: a box around the astronaut's face, from the hair to the chin."""
     from skimage.data import lbp_frontal_face_cascade_filename

@@ -72,6 +72,7 @@ def test_other_corrupt_lines_are_named(tmp_path: Path, line: bytes) -> None:
     assert path.read_bytes() == before
 
 
+@pytest.mark.slow
 def test_every_flipped_bit_is_found(tmp_path: Path) -> None:
     path = write(tmp_path / "r", record("a", metrics={"ssim": 0.58, "psnr": None}))
     whole = path.read_bytes()

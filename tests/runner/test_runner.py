@@ -186,6 +186,7 @@ def test_view_holds_declared_knowledge_alone(images: Path, monkeypatch: pytest.M
 # ---- pairs that do not apply
 
 
+@pytest.mark.slow
 def test_pair_that_does_not_apply_says_why(images: Path, small: Asset) -> None:
     records = run([Undefended(), LDP(dictionary=small)], [Guess()], images)
     assert [(record["sample"], record["status"]) for record in records] == [("*", "n/a"), ("0.png", "ok"), ("1.png", "ok")]
@@ -320,6 +321,7 @@ def test_interrupted_run_goes_on_and_ends_as_if_it_had_not_been(images: Path, sm
     assert len(file.read_bytes().splitlines()) == 4
 
 
+@pytest.mark.slow
 def test_failed_samples_are_tried_again(images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as broken:
         broken.setattr(Sketch, "reconstruct", lambda self, view, rng: None)

@@ -274,6 +274,7 @@ def test_a_worker_with_other_files_is_refused(images: Path, tmp_path: Path, clus
         list(execute.execute([plan], tmp_path / "out", engine))
 
 
+@pytest.mark.slow
 def test_missing_scheduler(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed", reason="needs dask.distributed: pip install distributed")
     from bench.runner.engines import cluster as module
@@ -291,6 +292,7 @@ def plan(images: Path) -> Plan:
     return prepare_plan([Undefended(), Affine(lifting="random")], [Sketch(), Guess()], images, task=RECONSTRUCTION)
 
 
+@pytest.mark.slow
 def test_status_from_start_to_end(plan: Plan, tmp_path: Path) -> None:
     out = tmp_path / "out"
     with pytest.raises(UserError, match="nothing was run there"):
@@ -312,6 +314,7 @@ def test_status_from_start_to_end(plan: Plan, tmp_path: Path) -> None:
     assert read_status(out).count == Count(done=9)
 
 
+@pytest.mark.slow
 def test_samples_in_progress_are_running_until_their_process_is_killed(plan: Plan, tmp_path: Path) -> None:
     out = tmp_path / "out"
     code = """
@@ -348,6 +351,7 @@ list(execute.execute([plan], Path("out")))
     assert not (out / directory.RUNNING).exists()
 
 
+@pytest.mark.slow
 def test_failed_samples_and_records_of_other_runs_are_counted_separately(
     images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -379,6 +383,7 @@ def test_failed_samples_and_records_of_other_runs_are_counted_separately(
     assert bench(capfd, "status", "x", "--results", out)[0] == 2
 
 
+@pytest.mark.slow
 def test_a_full_disk_loses_no_written_record(
     mine: str, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -403,6 +408,7 @@ def test_a_full_disk_loses_no_written_record(
     assert len(read_records(out)) == 6
 
 
+@pytest.mark.slow
 def test_interrupted_sweep_resumes(mine: str, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
     calls: list[int] = []
     reconstruct: Callable[..., Any] = Sketch.reconstruct

@@ -152,6 +152,7 @@ def test_shuffled_matches_have_no_geometry(keypoints: list[np.ndarray], matches:
     assert incremental_mapping.build_model(CAMERA, keypoints, found, "global", 0) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mapper", ["global", "incremental"])
 def test_the_mapped_cameras_are_the_true_ones(
     mapper: Mapper, geometries: dict[Pair, verification.Geometry], keypoints: list[np.ndarray], poses: list[pycolmap.Rigid3d]
@@ -260,6 +261,7 @@ def test_references_of_the_walk_exclude_the_stretch() -> None:
     assert all(image.name.startswith("db/courtyard-1") for image in found.queries)
 
 
+@pytest.mark.slow
 def test_the_task_takes_the_first_queries_of_a_scene() -> None:
     walk = Walk(views=5, others=3, steps=40, detail=0.1)
     collection = Structure(images=4).collect(None, walk)
