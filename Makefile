@@ -1,7 +1,7 @@
 # Two commands on a fresh machine with Python 3.11 or newer: `make demo` and `make test`. Each sets up what it needs.
 PYTHON ?= python3
 BIN := .venv/bin
-DEMO ?= --defense none --defense affine --defense ldp:epsilon=16 --defense ldp --attack dia --attack nearest
+DEMO ?= --defense none --defense affine --defense ldp:epsilon=16 --defense ldp --attack dia --attack keypoints
 DATA ?= ../shared/data
 
 SMOKE := --defense none --defense affine --defense ldp:epsilon=16 --attack dia
@@ -11,7 +11,7 @@ SPEED := runs/speed.json
 WORKERS ?= logical
 PYTEST := OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -q -n $(WORKERS) --dist worksteal
 
-.PHONY: demo test test-quick test-exhaustive coverage lint smoke check baseline bench assets
+.PHONY: demo test test-quick test-exhaustive coverage lint smoke check baseline bench assets docs
 
 demo: .venv/ready
 	$(BIN)/bench run $(DEMO)
@@ -53,6 +53,9 @@ bench: .venv/ready-to-test # speed of one core, as ratios within one run, agains
 		--benchmark-columns=min,median,rounds --benchmark-sort=name --benchmark-json=$(SPEED)
 	$(BIN)/bench check --baseline tests/speed.json --results $(SPEED)
 
+docs: .venv/ready-for-docs # the site, in build/site: open index.html from the disk; a warning is an error
+	$(BIN)/mkdocs build --strict
+
 assets: .venv/ready # hours: rebuilds the dictionaries and networks that are shipped
 	$(BIN)/python tools/make_assets.py --data $(DATA) --work work/assets
 	$(BIN)/python tools/train_context.py --data $(DATA) --work work/assets
@@ -64,5 +67,9 @@ assets: .venv/ready # hours: rebuilds the dictionaries and networks that are shi
 	touch $@
 
 .venv/ready-to-test: .venv/ready
-	$(BIN)/pip install -q -e '.[test]'
+	$(BIN)/pip install -q -e '.[test,lint,docs]'
+	touch $@
+
+.venv/ready-for-docs: .venv/ready
+	$(BIN)/pip install -q -e '.[docs]'
 	touch $@

@@ -1,15 +1,27 @@
-"""The clustering attack (the paper's Sec. 4.2): without W, but with other releases that use it.
+"""Clustering attack: estimates the descriptors in affine subspaces without the defense's database W.
 
-Step 1 computes the distances of the words of Z, the attacker's own database, to D. Step 2 selects the |V| nearest. Step 3
-clusters them: they lie near D where D contains real descriptors, its words or d, so there is one cluster more than D has words.
-The mean of each, weighted by 1 / dist(D, v) and projected onto D, is a candidate d̂_i. Step 4 selects d: a subspace Q' that
-meets D does so at a word of D. Words have distance zero from some Q', so the candidate with the largest min_j dist(d̂_i, Q'_j)
-is d.
+Source: the paper's Sec. 4.2.
 
-Choices that the paper leaves open. Clusters: farthest-first traversal from the word nearest to D (Gonzalez 1985); each word
-joins the nearest centre. Lloyd's iterations from there are worse, since they move the centres to where most words are. Q: the
-other subspaces of the photograph, and those of other releases that share its sub-database. If no Q' meets D, the candidate of
-least L1 norm is selected: a descriptor has zeros, and words that are means of many descriptors have none.
+Method, for a subspace D that contains the descriptor d and a words of W:
+
+1. Compute the distance of each word of Z to D.
+2. Select the |V| nearest words. They lie near the real descriptors in D, which are its a words and d.
+3. Cluster them into a + 1 clusters. Each cluster gives a candidate d̂_i: the mean of its words v, weighted by 1 / dist(D, v)
+   and projected onto D.
+4. Find the subspaces Q'_j that intersect D. Each intersects D at a word of D, so these words have distance zero from some Q'_j.
+   The estimate is the candidate with the largest min_j dist(d̂_i, Q'_j), scaled to unit norm.
+
+Knowledge: Z, a public database of the attacker's own, and other releases of the same defense with the same W.
+
+Choices that the paper leaves open:
+
+- Clusters come from a farthest-first traversal that starts at the word nearest to D (Gonzalez 1985). Each word joins the nearest
+  centre. Lloyd's iterations from there are worse, because they move the centres to the regions with most words.
+- The subspaces Q are the others of the photograph, and those of other releases that share its sub-database.
+- If no Q'_j intersects D, the estimate is the candidate of least L1 norm. A descriptor has zeros, and words that are means of
+  many descriptors have none.
+
+Limits: step 4 does not exclude a word of D that no Q'_j contains. Records note the fraction of words that are covered.
 """
 
 from __future__ import annotations
@@ -34,15 +46,15 @@ TOUCHING = 1e-12  # lower limit of the distance of a word to D
 
 @dataclass(frozen=True, kw_only=True)
 class Clustering(DescriptorAttack):
-    """Clusters public words near a subspace, and selects the cluster that no intersecting subspace explains."""
+    """Clusters the public words near a subspace, and selects the cluster that is farthest from all intersecting subspaces."""
 
     accepts = (Subspaces,)
     needs = frozenset({PublicDatabase, OtherReleases})
 
     database: Asset = Asset("shipped-public")
-    neighbours: int = 512  # |V|: public words nearest to the subspace
-    coverage: float = 0.95  # stop reading releases once this fraction of the photograph's words is covered
-    others: int = 800  # c: number of other releases that can be read
+    neighbours: int = 512  # |V|, public words nearest to the subspace
+    coverage: float = 0.95  # fraction of the photograph's words, from 0 to 1, at which no further releases are read
+    others: int = 800  # c, the maximum number of other releases that are read
 
     def __post_init__(self) -> None:
         if self.neighbours < 2:
@@ -69,7 +81,18 @@ class Clustering(DescriptorAttack):
 
 
 def build_candidates(release: Subspaces, words: Bytes, nearest: Indices, distances: Doubles, clusters: int) -> Doubles:
-    """Build the d̂_i of each subspace from its nearest words, nearest first. (K, D) words, (N, |V|) twice -> (N, k, D)"""
+    """Build the candidates d̂_i of each subspace from its nearest words (Step 3).
+
+    Parameters
+    ----------
+    words : (K, D)
+    nearest, distances : (N, |V|) indices of the words, nearest first, and their distances to the subspace
+    clusters : k
+
+    Returns
+    -------
+    (N, k, D)
+    """
     feet, frames = feet_and_frames(release)
     means = np.empty((len(release), clusters, words.shape[1]))
     for start in range(0, len(release), BATCH):
@@ -83,7 +106,7 @@ def build_candidates(release: Subspaces, words: Bytes, nearest: Indices, distanc
 
 
 def select_candidates(candidates: Doubles, shared: SharedSubDatabase) -> Floats:
-    """Select the candidate of each subspace that is farthest from all subspaces that meet it (Step 4). (N, k, D) -> (N, D)"""
+    """Select the candidate of each subspace that is farthest from all intersecting subspaces (Step 4). (N, k, D) -> (N, D)"""
     distances = compute_intersection_distances(candidates, shared)  # (N, k)
     met = np.isfinite(distances).all(axis=1)  # (N,)
     best = np.where(met, distances.argmax(axis=1), np.abs(candidates).sum(axis=2).argmin(axis=1))
@@ -91,16 +114,16 @@ def select_candidates(candidates: Doubles, shared: SharedSubDatabase) -> Floats:
 
 
 def cluster(rows: Floats, clusters: int) -> Indices:
-    """Return the cluster of each row, by farthest-first traversal from the first row. (n, V, D) unit norm -> (n, V)
+    """Assign each row to a cluster by a farthest-first traversal from the first row. (n, V, D) unit norm -> (n, V)
 
-    Rows are compared by their cosines. If all rows differ, no cluster is empty.
+    The distance of two rows is compared by their cosine. If all rows differ, no cluster is empty.
     """
     every = np.arange(len(rows))
-    closeness = np.empty((*rows.shape[:2], clusters), dtype=np.float32)  # (n, V, k) to the centres
+    closeness = np.empty((*rows.shape[:2], clusters), dtype=np.float32)  # (n, V, k) cosines with the centres
     centre = np.zeros(len(rows), dtype=np.int64)
     for number in range(clusters):
         closeness[:, :, number] = (rows @ rows[every, centre][:, :, None])[:, :, 0]
-        closeness[every, centre, number] = np.inf  # rounding must not assign a centre to another cluster
+        closeness[every, centre, number] = np.inf  # despite rounding, a centre belongs to its own cluster
         centre = closeness[:, :, : number + 1].max(axis=2).argmin(axis=1)
     return closeness.argmax(axis=2)
 

@@ -1,9 +1,18 @@
-"""The context attack: finds the true word of a keypoint from the candidates of nearby keypoints. Not in the paper.
+"""Context attack: finds the true word of a keypoint by the candidates of nearby keypoints.
 
-Wrong words are drawn uniformly from the dictionary, while true words fit the photograph at that position. The context model
-(`bench/context`), trained on public photographs, computes the posterior of each candidate and of none. The prior follows from
-the configuration of the defense. The model also predicts the descriptor for the case that the true word is none of the
-candidates.
+Source: not in the paper.
+
+Method:
+
+1. The configuration of the defense gives the prior probability that a candidate is the true word.
+2. The context model (`bench/context`) computes the posterior of each candidate, and of the case that none is true. Wrong words
+   are uniform over the dictionary, whereas true words fit the photograph at that position.
+3. The model also predicts the descriptor for the case that no candidate is true.
+4. The estimate is the likeliest candidate, or the posterior mean (`estimate`).
+
+Knowledge: a network trained on public photographs for that defense, extractor and dictionary.
+
+Limits: without such a network the attack does not apply.
 """
 
 from __future__ import annotations
@@ -26,13 +35,13 @@ from bench.types import Floats, WordSets
 
 @dataclass(frozen=True, kw_only=True)
 class Context(DescriptorAttack):
-    """Weighs the candidates of each keypoint by the candidates of nearby keypoints."""
+    """Computes the probability of each candidate word from the candidates of nearby keypoints."""
 
     accepts = (WordSets,)
     needs = frozenset({PublicAssets})
 
-    # The likeliest candidate, or the posterior mean, which includes the predicted descriptor. The mean has the smaller angle, but
-    # it is smoother than a descriptor, so the network for raw descriptors reconstructs a worse image from it.
+    # The likeliest candidate, or the posterior mean, which includes the predicted descriptor. The mean has the smaller angle. It
+    # is smoother than a descriptor, so the network for raw descriptors reconstructs a worse image from it.
     estimate: Literal["word", "mean"] = "word"
     weights: Asset = Asset("shipped")
 

@@ -1,9 +1,17 @@
-"""The database attack (the paper's Sec. 4.1): with W, finds the adversarial words of a subspace, then the descriptor.
+"""Database attack: estimates the descriptors in affine subspaces with the defense's database W.
 
-Step 1 sorts the words by their distance to D. Step 2 takes the nearest as the adversarial descriptors â; their number is in the
-configuration of the defense. They lie in D up to the float32 precision of the release, about 1e-7. Step 3 takes the next |V|
-words. They lie near D where D contains real descriptors, an â or d, so the |U| of them that are farthest from every â are near
-d. The estimate is the paper's d̂: their mean, weighted by 1 / dist(D, u), projected onto D. Then d̂ is scaled to unit norm.
+Source: the paper's Sec. 4.1.
+
+Method, for a subspace D that contains the descriptor d and a words of W:
+
+1. Sort the words of W by their distance to D.
+2. The a nearest words are the adversarial descriptors â. They lie in D up to the float32 precision of the release, about 1e-7.
+3. The next |V| words lie near the real descriptors in D: an â or d. Those |U| of them that are farthest from every â are near d.
+4. The estimate is the paper's d̂, the mean of U, weighted by 1 / dist(D, u) and projected onto D. It is then scaled to unit norm.
+
+Knowledge: W. The number a follows from the public configuration of the defense.
+
+Limits: the paper does not state |V| and |U|. The defaults are tuned on photographs that no result is reported on.
 """
 
 from __future__ import annotations
@@ -23,13 +31,13 @@ from bench.types import Floats, Subspaces
 
 @dataclass(frozen=True, kw_only=True)
 class Database(DescriptorAttack):
-    """Finds the words of the database in a subspace, and estimates the descriptor from the words next nearest to it."""
+    """Finds the database words in a subspace, and estimates the descriptor from the words next nearest to the subspace."""
 
     accepts = (Subspaces,)
     needs = frozenset({DefenseDatabase})
 
-    neighbours: int = 4000  # |V|: words next nearest to the subspace
-    estimators: int = 3  # |U|: those of them that form the estimate
+    neighbours: int = 4000  # |V|, words next nearest to the subspace
+    estimators: int = 3  # |U|, those of them whose mean is the estimate
 
     def __post_init__(self) -> None:
         if not 1 <= self.estimators <= self.neighbours:

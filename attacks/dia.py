@@ -1,10 +1,20 @@
-"""DIA, the direct inversion attack (Dusmanu et al., CVPR 2021; the paper's Tables 1 and 4).
+"""DIA, the direct inversion attack: reconstructs the photograph with a network trained for the defense.
 
-A network reconstructs the photograph from the release. Its input stacks the release of a keypoint: the descriptor itself (the
-upper bound, "Raw"), the m words, or the parameters of a subspace (not its random origin and basis, which are noise:
-`encoding.py`). The network must be trained for that distribution of releases, since a network for another defense would make
-the defense look safe. The result is the mean over the releases of the mirrored and rotated photograph, if the extractor
-declares these permutations.
+Source: Dusmanu et al., CVPR 2021; the paper's Tables 1 and 4.
+
+Method:
+
+1. Encode each keypoint of the release: the descriptor, the m words, or the parameters of the subspace. The random origin and
+   basis of a subspace are noise and no part of the encoding `invariant` (`bench/inversion/encoding.py`).
+2. The network reconstructs the photograph from the encoded keypoints.
+3. If the extractor declares how descriptors change when the photograph is mirrored or rotated, repeat both steps for all eight
+   symmetries and average the reconstructions.
+
+Knowledge: a network trained on public photographs for that distribution of releases. With undefended descriptors the result is
+the upper bound, the paper's row "Raw".
+
+Limits: a network for another defense would make the defense look safe. So without a network for this defense the attack does not
+apply.
 """
 
 from __future__ import annotations
@@ -59,7 +69,7 @@ class DIA(ImageAttack):
 
 
 def _choose(asset: str, defense: Defense, extractor: Extractor, public: Public) -> tuple[Path | None, str | None]:
-    """Return the path of suitable weights, or the reason why there are none."""
+    """Return the path of the weights for these releases, or the reason why there are none."""
     candidates = sorted(ASSETS.glob("inversion-*.safetensors")) if asset == "shipped" else [Path(asset)]
     reasons = []
     for path in candidates:

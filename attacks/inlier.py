@@ -1,10 +1,18 @@
-"""The inlier attack: the server takes the keypoints that RANSAC verifies, with the map's descriptors of their matches.
+"""Inlier attack: reconstructs the photograph from the keypoints that the server verifies by RANSAC.
 
-From the paper's supplement: the reconstruction shows static content that is in the map, and not what moves in front of it. The
-attack applies to any release that a server can localize, whatever its guarantee for one descriptor.
+Source: the paper's supplement, "Sensitivity of Inlier Content".
 
-Subspaces are too ambiguous for image retrieval, but they localize when matched with the right references. So they are matched
-with all references.
+Method:
+
+1. Localize the release in the server's map. Subspaces are too ambiguous for image retrieval, but they localize when matched with
+   the right references. So they are matched with all references.
+2. Select the keypoints of the matches that RANSAC verifies, and give each the map's descriptor of its match.
+3. The network for raw descriptors reconstructs the photograph from these keypoints alone.
+
+Knowledge: the server's map.
+
+Limits: the reconstruction shows static content that is in the map, and no moving objects in front of it. The attack applies to
+any release that a server can localize, whatever its guarantee for one descriptor.
 """
 
 from __future__ import annotations
@@ -22,13 +30,13 @@ from bench.types import Descriptors, Subspaces, WordSets
 
 @dataclass(frozen=True, kw_only=True)
 class Inlier(SelectiveAttack):
-    """Reconstructs from the keypoints that the server verifies, with the map's descriptors of their points."""
+    """Reconstructs the photograph from the keypoints that the server verifies, with the map's descriptors."""
 
     accepts = (Descriptors, Subspaces, WordSets)
     needs = frozenset({ServerMap})
 
-    retrieved: int = 20  # references that a query is matched with; subspaces: all
-    trials: int = 30_000  # of RANSAC, at most
+    retrieved: int = 20  # references that a query is matched with; subspaces are matched with all
+    trials: int = 30_000  # maximum number of RANSAC's trials
 
     def select(self, view: View, rng: np.random.Generator) -> Selection:
         server = view.know(ServerMap).server

@@ -1,10 +1,19 @@
-"""The intersection attack: with other releases only, and without W or a database of the attacker's own. Not in the paper.
+"""Intersection attack: reconstructs the database of affine subspaces from their intersections, then attacks with it.
 
-Two subspaces that contain the same word intersect in it, and the words of W are 8-bit vectors. So the intersections of
-subspaces that share a sub-database give its words to the last bit. The points in two or more subspaces form a reconstructed
-database. Then the steps of the database attack follow (the paper's Sec. 4.1): the adversarial words of a subspace are those in
-it, and the words next nearest to it that are farthest from these estimate the descriptor. The paper's clustering attack needs Z
-as well.
+Source: not in the paper. Its clustering attack needs a database Z as well.
+
+Method:
+
+1. Find the other releases that share the photograph's sub-database, and all intersections of their subspaces.
+2. Two subspaces that contain the same word intersect in it, and the words of W are 8-bit vectors. So the intersections give the
+   words to the last bit. The points in two or more subspaces form the reconstructed database.
+3. Continue as the database attack (the paper's Sec. 4.1). The adversarial words of a subspace are the reconstructed words in it.
+   Of the |V| words next nearest to it, the |U| that are farthest from the adversarial words estimate the descriptor.
+
+Knowledge: other releases of the same defense with the same database. The attacker has no database.
+
+Limits: a word in only one of the subspaces is not reconstructed. Without any word, the estimate is the direction of the point of
+the subspace nearest to zero.
 """
 
 from __future__ import annotations
@@ -28,15 +37,15 @@ from bench.types import Bytes, Floats, Subspaces
 
 @dataclass(frozen=True, kw_only=True)
 class Intersection(DescriptorAttack):
-    """Reconstructs the words of the photograph's sub-database from subspace intersections, and attacks with these."""
+    """Reconstructs the photograph's sub-database from subspace intersections, and attacks with its words."""
 
     accepts = (Subspaces,)
     needs = frozenset({OtherReleases})
 
-    neighbours: int = 1024  # |V|: reconstructed words next nearest to the subspace
-    estimators: int = 2  # |U|: those of them that form the estimate
-    coverage: float = 0.95  # stop reading releases once this fraction of the photograph's words is covered
-    others: int = 800  # c: number of other releases that can be read
+    neighbours: int = 1024  # |V|, reconstructed words next nearest to the subspace
+    estimators: int = 2  # |U|, those of them whose mean is the estimate
+    coverage: float = 0.95  # fraction of the photograph's words, from 0 to 1, at which no further releases are read
+    others: int = 800  # c, the maximum number of other releases that are read
 
     def __post_init__(self) -> None:
         if not 1 <= self.estimators <= self.neighbours:
@@ -53,12 +62,15 @@ class Intersection(DescriptorAttack):
         release, adversarial = require_subspaces(view)
         shared = find_shared_sub_database(release, view.know(OtherReleases).draw(self.others), adversarial, self.coverage)
         words = reconstruct_database(find_intersections_within(shared.subspaces))
-        view.notes.append(f"{shared.summary()}; {len(words)} words rebuilt")
+        view.notes.append(f"{shared.summary()}; {len(words)} words reconstructed")
         return estimate_descriptors(release, words, adversarial, self.neighbours, self.estimators)
 
 
 def estimate_descriptors(release: Subspaces, words: Bytes, adversarial: int, neighbours: int, estimators: int) -> Floats:
-    """Estimate descriptors from words; without words, by the direction of each subspace's point nearest to zero. -> (N, D)"""
+    """Estimate descriptors from the reconstructed words (K, D). -> (N, D)
+
+    Without words, return the direction of the point of each subspace nearest to zero.
+    """
     if len(words) == 0:
         return unit_rows(feet_and_frames(release)[0].astype(np.float32))
     nearest, distances = find_nearest_to_subspaces(release, words, adversarial + neighbours)

@@ -1,18 +1,27 @@
-"""The lattice attack: uses only that descriptors are 8-bit vectors, scaled to unit norm. Not in the paper.
+"""Lattice attack: finds the few 8-bit vectors in an affine subspace, one of which is the descriptor.
 
-D contains the secret, words of a database and random directions. The secret and the words are multiples of 8-bit vectors. No
-other vector in D is, since the directions are random. `bench/geometry/lattice.py` finds all of them from the float32 release:
-the descriptor and the adversarial words. These are dim / 2 + 1 candidates for a hybrid lifting, dim + 1 for an adversarial one,
-and the descriptor alone for a random one. Neither random directions nor the dimension prevent this, and zeros are not needed.
+Source: not in the paper.
 
-`bench/geometry/candidates.py` then selects the descriptor among the candidates; only this choice is uncertain. With a database
-of centres of large clusters it is always right. With one of raw descriptors, it is known only for words that occur twice in a
-photograph. An attacker with the database need not guess: they remove its words.
+Method:
 
-Noise in the descriptor before the lifting prevents the attack: 1e-5 per component with the kernel's WEIGHT, 1e-4 (a twentieth
-of an 8-bit unit) with every tested WEIGHT. A release in half precision prevents it with this WEIGHT, but with a WEIGHT of 10^4
-not fully (29% were found at dim 2). The words are still found, and one of them is returned. If nothing is found, the estimate
-is the direction of the point of D nearest to zero.
+1. A subspace D is spanned by the descriptor, words of a database and random directions. The descriptor and the words are 8-bit
+   vectors, scaled to unit norm. No other vector in D is, since the directions are random. `bench/geometry/lattice.py` finds all
+   of them from the float32 release. A hybrid lifting has dim / 2 + 1 of these candidates, an adversarial one dim + 1, and a
+   random one the descriptor alone.
+2. `bench/geometry/candidates.py` selects the descriptor among the candidates. Only this choice is uncertain.
+
+Knowledge: nothing beside the release. That descriptors are 8-bit vectors is a public fact of the extractor.
+
+Limits of step 1:
+
+- More random directions, a greater dimension or descriptors without zeros do not prevent the attack.
+- Noise in the descriptor before the lifting prevents it: 1e-5 per component with the kernel's WEIGHT, and 1e-4 (a twentieth of
+  an 8-bit unit) with every tested WEIGHT. The words are still found, and one of them is returned.
+- A release in half precision prevents it with this WEIGHT, but not fully with a WEIGHT of 10^4: 29% were found at dim 2.
+- If nothing is found, the estimate is the direction of the point of D nearest to zero.
+
+Limits of step 2: with a database of centres of large clusters the choice is always right. With a database of raw descriptors, a
+candidate is known to be a word only if it occurs twice in the photograph. An attacker with the database removes all of its words.
 """
 
 from __future__ import annotations
@@ -31,7 +40,7 @@ from bench.types import Floats, Subspaces
 
 @dataclass(frozen=True, kw_only=True)
 class Lattice(DescriptorAttack):
-    """Finds the descriptor as one of the few integer vectors of its subspace."""
+    """Finds the 8-bit vectors in a subspace, and selects the descriptor among them."""
 
     accepts = (Subspaces,)
 

@@ -1,7 +1,12 @@
-"""The nearest attack (Dusmanu et al., CVPR 2021; the paper's Table 1).
+"""Nearest attack: replaces each affine subspace by the nearest word of a public database.
 
-It replaces each subspace by its nearest neighbour in a public database, the attacker's own Z. In the defense's W the nearest
-word would be an adversarial descriptor.
+Source: Dusmanu et al., CVPR 2021; the paper's Table 1.
+
+Method: the estimate is the word of Z with the smallest distance to the subspace.
+
+Knowledge: Z, a public database of the attacker's own.
+
+Limits: the defense's database W would not help. The word of W nearest to a subspace is an adversarial descriptor.
 """
 
 from __future__ import annotations
@@ -20,7 +25,7 @@ from bench.types import Floats, Subspaces
 
 @dataclass(frozen=True, kw_only=True)
 class Nearest(DescriptorAttack):
-    """Estimates the descriptor by the public word nearest to the subspace."""
+    """Replaces each subspace by the public word nearest to it."""
 
     accepts = (Subspaces,)
     needs = frozenset({PublicDatabase})

@@ -1,7 +1,15 @@
-"""The repeat attack: uses several releases of the same features, as from a video or a client that retries. Not in the paper.
+"""Repeat attack: combines several releases of the same features, as from a video or from a client that sends again.
 
-Two liftings of one descriptor are subspaces that intersect in it, so two suffice. In word sets the true word recurs: the word
-in most of T sets has the greatest likelihood. T releases are T ε-LDP and no more.
+Source: not in the paper.
+
+Method:
+
+- Subspaces: two liftings of one descriptor intersect in it. The estimate is that point, so two releases are enough.
+- Word sets: the true word recurs. The word in most of the T sets has the greatest likelihood.
+
+Knowledge: `releases` - 1 further releases of the same photograph.
+
+Limits: T releases of an ε-LDP defense are T ε-LDP, so the attack on word sets is bounded by T ε.
 """
 
 from __future__ import annotations
@@ -21,12 +29,12 @@ from bench.types import Floats, Indices, Release, Subspaces, WordSets
 
 @dataclass(frozen=True, kw_only=True)
 class Repeat(DescriptorAttack):
-    """Estimates the descriptor by the intersection of a keypoint's subspaces, or by the word that its sets repeat."""
+    """Estimates the descriptor by the intersection of a keypoint's subspaces, or by the word in most of its sets."""
 
     accepts = (Subspaces, WordSets)
     needs = frozenset({RepeatedReleases})
 
-    releases: int = 2  # of the same features, including the first
+    releases: int = 2  # number of releases of the same features, including the first
 
     def __post_init__(self) -> None:
         if self.releases < 1:
@@ -48,7 +56,7 @@ class Repeat(DescriptorAttack):
 
 
 def label_candidates(sets: Sequence[WordSets]) -> Indices:
-    """Label candidates: by their words, or, without a dictionary, by one number per pattern. -> (N, T m)"""
+    """Return the word of each candidate, or without a dictionary one number per distinct pattern. -> (N, T m)"""
     words = [release.words for release in sets if release.words is not None]
     if len(words) == len(sets):
         return np.concatenate(words, axis=1)

@@ -1,15 +1,25 @@
-"""The sparsity attack: uses only that descriptors are non-negative with many exact zeros. Not in the paper.
+"""Sparsity attack: finds the descriptor in an affine subspace as a point with more zeros than chance allows.
 
-The non-negative points of D form a polytope; dim components are zero at a vertex. SIFT has a median of about 20 zeros in 128,
-so the secret is a *degenerate* vertex with more zeros. Such a vertex of unit norm does not occur by chance: it is the secret,
-or a word of the database that is as sparse (`bench/geometry/candidates.py` selects one). A walk over vertices by linear
-programming finds them (`bench/geometry/vertices.py`).
+Source: not in the paper.
 
-The attack fails for descriptors with at most dim zeros, which are no degenerate vertex, and often for those with few more,
-since few objectives lead to them. It also fails if words of the database are sparse, above all raw descriptors. If no vertex is
-found, the estimate is the direction of the point of D nearest to zero. The best other vertex is farther from the secret (a mean
-cosine of 0.4 to 0.5 at any dimension, against 0.83 to 0.63 for dim 2 to 16). `lattice`, which uses the 8-bit grid, has none of
-these limits.
+Method:
+
+1. The non-negative points of a subspace D form a polytope, and dim components are zero at a vertex. SIFT has a median of about 20
+   zeros in 128 components, so the descriptor is a *degenerate* vertex: it has more than dim zeros.
+2. A walk over vertices by linear programming finds degenerate vertices of unit norm (`bench/geometry/vertices.py`). Such a
+   vertex does not occur by chance. It is the descriptor, or a word of the database that is as sparse.
+3. `bench/geometry/candidates.py` selects one of them.
+
+Knowledge: nothing beside the release. That descriptors are non-negative with many exact zeros is a public fact of the extractor.
+
+Limits:
+
+- A descriptor with at most dim zeros is no degenerate vertex and is never found. One with few more is often missed, since few
+  objectives lead to it.
+- The choice fails if words of the database are sparse, above all raw descriptors.
+- If no vertex is found, the estimate is the direction of the point of D nearest to zero. It has a mean cosine with the descriptor
+  of 0.83 to 0.63 for dim 2 to 16. The best other vertex is farther: 0.4 to 0.5 at any dimension.
+- `lattice`, which uses the 8-bit grid, has none of these limits.
 """
 
 from __future__ import annotations
@@ -34,12 +44,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Sparsity(DescriptorAttack):
-    """Finds the descriptor as the vertex with more zeros than chance allows."""
+    """Finds the descriptor as a point of its subspace with more zeros than chance allows."""
 
     accepts = (Subspaces,)
 
     pivots: int = 100  # steps of the walk over vertices, per dimension of the subspace
-    ties: int = 4  # components equal to the maximum that end the walk: SIFT clips at 0.2, a cluster centre does not
+    ties: int = 4  # components equal to the maximum, at which the walk ends: SIFT clips at 0.2, a cluster centre does not
 
     def __post_init__(self) -> None:
         if self.pivots < 1:
@@ -61,7 +71,7 @@ class Sparsity(DescriptorAttack):
         return estimates
 
     def find_candidates(self, release: Subspaces, rng: np.random.Generator) -> tuple[Indices, Floats]:
-        """Find degenerate vertices of unit norm: (n,) the keypoint of each, and (n, D) unit norm."""
+        """Return the degenerate vertices of unit norm: (n,) the keypoint of each, and (n, D) the vertices."""
 
         def has_ties(x: Tensor) -> Tensor:
             return (x >= x.amax(dim=1, keepdim=True) - EQUAL_TOLERANCE).sum(dim=1) >= self.ties

@@ -1,10 +1,12 @@
-"""The privacy benchmark for local image features: what an attacker still sees, what a server can still do.
+"""Privacy benchmark for local image features: reconstruction by an attacker, and utility for a server.
 
+```python
 import bench
-from defenses.ldp import LDP
 from attacks.dia import DIA
+from defenses.ldp import LDP
 
 records = bench.run(defenses=[LDP(epsilon=10)], attacks=[DIA()], images="photos")
+```
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = ["__version__", "load_records", "protect", "run"]
 
-# Imported when first used, so that `import bench` and `bench --help` cost nothing.
+# Imported at first use, so that `import bench` and `bench --help` are fast.
 _HOMES = {"protect": "bench.mechanisms.protection", "load_records": "bench.runner.records", "run": "bench.runner.execute"}
 
 

@@ -24,10 +24,11 @@ K = TypeVar("K", bound=Knowledge)
 
 
 class Plugin:
-    """Base class of all plugins. A plugin's name is the name of its file."""
+    """Base class of all plugins."""
 
     @classmethod
     def name(cls) -> str:
+        """Return the plugin's name: the name of its file, with hyphens for underscores."""
         return cls.__module__.rpartition(".")[2].replace("_", "-")
 
     @classmethod
@@ -37,7 +38,7 @@ class Plugin:
 
     @classmethod
     def description(cls) -> str:
-        """Return the summary, with whatever else a list of plugins shows."""
+        """Return the text of `bench list`: the summary, and further declarations of some kinds of plugins."""
         return cls.summary()
 
 
@@ -46,9 +47,9 @@ class Privacy:
     """The guarantee of a defense for one descriptor."""
 
     guarantee: str  # "none", "epsilon-ldp", "epsilon-ldp-by-word" of a memoized defense, "d-chi", ...
-    epsilon: float | None = None  # nats, of one descriptor; None where nothing is guaranteed
+    epsilon: float | None = None  # nats, for one descriptor; None without a guarantee
     log10_true: float | None = None  # log10 of the probability that the true word is in its set
-    # Nats per unit of distance, where descriptors are hidden among near ones ("d-chi"): not comparable with ε.
+    # Nats per unit of distance, if the guarantee grows with the distance of descriptors ("d-chi"); not comparable with ε.
     per_distance: float | None = None
 
 
@@ -59,9 +60,9 @@ class Defense(Plugin, ABC):
     """Turns the secret features into a release."""
 
     releases: ClassVar[type[Release]]
-    # Settings that one trained attacker supports. A network trained for this plugin sees them drawn at random.
+    # Field -> the values that one trained network supports. Training draws them at random.
     supported_settings: ClassVar[Mapping[str, Between | OneOf]] = {}
-    # The field that names the dictionary by which descriptors are quantised, and the field with the number of its words in use.
+    # Field that names the dictionary for the quantisation, and field with the number of its words in use.
     dictionary_field: ClassVar[str | None] = None
     word_count_field: ClassVar[str | None] = None
     # Whether released descriptors carry added noise.
@@ -73,30 +74,36 @@ class Defense(Plugin, ABC):
 
     @abstractmethod
     def privacy(self, public: Public) -> Privacy:
-        """Return the guarantee for one descriptor, and the probability of the true word where it can be computed."""
+        """Return the guarantee for one descriptor, and the probability of the true word if it can be computed."""
 
     def distance(self, secret: Features, public: Public, one: int, other: int) -> Fraction:
-        """Return the distance of two descriptors in the guarantee: under ε-LDP 1, and 0 of a descriptor to itself."""
+        """Return the distance between descriptors `one` and `other` of the secret, in the metric of the guarantee.
+
+        Under ε-LDP the distance of different descriptors is 1. `one` and `other` are indices.
+        """
         return Fraction(int(one != other))
 
     def is_memoized(self) -> bool:
-        """Whether one device gives equal descriptors equal answers. `rng` is then the device: in the same state at each call."""
+        """Return whether a device always gives the same answer for equal descriptors.
+
+        `protect` then receives a generator in the same state at each call: the state stands for the device.
+        """
         return False
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LiftedRelease:
-    """A release of subspaces, with what only its owner knows."""
+    """A release of subspaces, with its secret: the database words in each subspace."""
 
     release: Subspaces
-    words: Indices  # (N, adversarial) rows of the defense's `database` that each subspace goes through
+    words: Indices  # (N, adversarial) rows of the defense's `database` in each subspace
 
 
 class Lifting(Defense):
     """A defense that hides each descriptor in a subspace, which may also contain words of a database.
 
-    The number of words is public, as the whole configuration is. An attack on such words asks for this type. The field `database`
-    names the database.
+    The number of words is public, as is the whole configuration. An attack on such words requires a defense of this type. The
+    field `database` names the database.
     """
 
     releases = Subspaces
@@ -104,14 +111,15 @@ class Lifting(Defense):
     @property
     @abstractmethod
     def adversarial(self) -> int:
-        """Number of database words that a subspace goes through."""
+        """Number of database words in each subspace."""
 
     @abstractmethod
     def lift(self, secret: Features, public: Public, rng: np.random.Generator) -> LiftedRelease:
-        """Return the release of `protect` with the words that it goes through."""
+        """Return the release of `protect`, with the database words in its subspaces."""
 
     @final
     def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> Subspaces:
+        """Return the release of `lift`."""
         return self.lift(secret, public, rng).release
 
 
@@ -120,16 +128,16 @@ class Lifting(Defense):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class View:
-    """All that an attack may read: the release, its public configuration, and the knowledge that the attack declared to need."""
+    """Input of an attack: the release, its public configuration, and the knowledge that the attack declares in `needs`."""
 
     release: Release
     defense: Defense  # its configuration is public; its randomness is not
     extractor: Extractor
     knowledge: Mapping[type[Knowledge], Callable[[], Knowledge]] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)  # what the attack reports of its run; the record keeps it
+    notes: list[str] = field(default_factory=list)  # remarks of the attack, copied to the record
 
     def know(self, kind: type[K]) -> K:
-        """Return the knowledge of that class.
+        """Return the knowledge of class `kind`.
 
         Raises
         ------
@@ -154,16 +162,19 @@ class Attack(Plugin, ABC):
         return 0
 
     def explain_incompatible(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
-        """Return why this attack, as configured, has nothing adapted to that defense; None if it has."""
+        """Return the reason why this attack, as configured, has nothing adapted to the defense; None if it has.
+
+        For example, no network was trained for the releases of that defense.
+        """
         return None
 
     def assets(self, defense: Defense, extractor: Extractor, public: Public) -> Mapping[str, str]:
-        """Return field -> digest of the content that this attack would use against that defense. Records hold it for the name."""
+        """Return field -> digest of the file that this attack uses against the defense. Records hold it in place of the name."""
         return {}
 
     @final
     def explain_not_applicable(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
-        """Return why this attack does not apply to that defense, decided by types and declarations; None if it does."""
+        """Return the reason why this attack does not apply to the defense, by types and declarations; None if it applies."""
         if not issubclass(defense.releases, self.accepts):
             accepted = " or ".join(kind.__name__ for kind in self.accepts)
             return f"{self.name()} attacks {accepted}; {defense.name()} releases {defense.releases.__name__}"
@@ -171,7 +182,7 @@ class Attack(Plugin, ABC):
 
 
 class DescriptorAttack(Attack):
-    """Recovers one descriptor a keypoint. The network for raw descriptors then reconstructs the image."""
+    """Recovers one descriptor per keypoint. The network for raw descriptors then reconstructs the image."""
 
     @abstractmethod
     def recover(self, view: View, rng: np.random.Generator) -> Floats:
@@ -180,18 +191,18 @@ class DescriptorAttack(Attack):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Selection:
-    """Descriptors of some of a release's keypoints."""
+    """Estimated descriptors for some keypoints of a release."""
 
     rows: Indices  # (R,) of the release
     descriptors: Floats  # (R, D) unit norm
 
 
 class SelectiveAttack(Attack):
-    """Recovers descriptors where it can. The network for raw descriptors reconstructs the image from those keypoints alone."""
+    """Recovers descriptors of selected keypoints. The network for raw descriptors reconstructs the image from these alone."""
 
     @abstractmethod
     def select(self, view: View, rng: np.random.Generator) -> Selection:
-        """Return the keypoints that it is sure of, perhaps none, and float32 estimates of their descriptors."""
+        """Return the selected keypoints, possibly none, and float32 estimates of their descriptors."""
 
 
 class ImageAttack(Attack):
@@ -203,21 +214,21 @@ class ImageAttack(Attack):
 
 
 def explain_no_words(defense: Defense) -> str | None:
-    """Return why the subspaces of that defense go through no word of a database; None if they do."""
+    """Return the reason why the subspaces of the defense contain no database word; None if they contain some."""
     if not isinstance(defense, Lifting):
-        return f"{defense.name()} does not say how many words its subspaces go through"
+        return f"{defense.name()} does not say how many database words its subspaces contain"
     if defense.adversarial == 0:
-        return f"{defense.name()} as configured leads its subspaces through no word"
+        return f"{defense.name()} as configured has no database words in its subspaces"
     return None
 
 
 def require_subspaces(view: View) -> tuple[Subspaces, int]:
-    """Return the subspaces that a lifting released, and how many words of its database each goes through.
+    """Return the subspaces that a lifting released, and the number of database words in each.
 
     Raises
     ------
     TypeError
-        if it is another release, or another defense's.
+        if the release is of another type, or the defense is no `Lifting`.
     """
     release, defense = view.release, view.defense
     if not isinstance(release, Subspaces) or not isinstance(defense, Lifting):
@@ -246,11 +257,11 @@ class Metric(Plugin, ABC):
 
     @abstractmethod
     def __call__(self, truth: Floats, estimate: Floats) -> float | None:
-        """Return the value; None where it is not finite. Images are (H, W, 3) in [0, 1], descriptors (N, D)."""
+        """Return the value; None if it is not finite. Images are (H, W, 3) in [0, 1], descriptors are (N, D)."""
 
 
 class LocalMetric(Metric):
-    """A metric of images that has a value for each pixel, so that parts of an image can be compared."""
+    """A metric of images with a value for each pixel, so that it can be averaged over parts of an image."""
 
     compares = "images"
 
@@ -260,7 +271,7 @@ class LocalMetric(Metric):
 
 
 class Dataset(Plugin, ABC):
-    """A scene that was photographed, for tasks that need camera poses."""
+    """A photographed scene, for tasks that need camera poses."""
 
     @abstractmethod
     def scene(self) -> Scene:
@@ -269,22 +280,22 @@ class Dataset(Plugin, ABC):
         Raises
         ------
         UserError
-            naming file and line, if something of it is missing or damaged.
+            if a part is missing or damaged; the message names file and line.
         """
 
 
 class Extractor(Plugin, ABC):
     """Turns a photograph into `Features`."""
 
-    # Public facts about its descriptors, which attacks may use.
-    exact_zeros: bool = False  # none is negative, and many components are exactly zero
-    eight_bit: bool = False  # each is an 8-bit integer vector, scaled to unit norm
+    # Public properties of the descriptors, which attacks may use.
+    exact_zeros: bool = False  # no component is negative, and many are exactly zero
+    eight_bit: bool = False  # each descriptor is an 8-bit integer vector, scaled to unit norm
 
     @abstractmethod
     def extract(self, image: np.ndarray, source: Path | None = None) -> Features:
-        """Extract from an (H, W, 3) uint8 RGB image, in the order of `Features.by_position`.
+        """Return the features of an (H, W, 3) uint8 RGB image, in the order of `Features.by_position`.
 
-        `source` is the photograph's file, where it has one.
+        `source` is the photograph's file, if it has one.
 
         Raises
         ------
@@ -293,13 +304,13 @@ class Extractor(Plugin, ABC):
         """
 
     def mirror_order(self) -> Indices | None:
-        """Return the order (D,) of a descriptor's components in the mirrored photograph; None if there is none."""
+        """Return the (D,) permutation of a descriptor's components in the mirrored photograph; None if there is none."""
         return None
 
     def turn_order(self) -> Indices | None:
-        """Return the same for the photograph turned by a quarter, counter-clockwise."""
+        """Return the permutation for the photograph turned by 90 degrees counter-clockwise; None if there is none."""
         return None
 
     def without_limit(self) -> Extractor:
-        """Return the extractor without its limit on the number of keypoints: dictionaries are built from many."""
+        """Return the extractor without its limit on the number of keypoints, for the construction of dictionaries."""
         return self

@@ -8,7 +8,7 @@ import numpy as np
 
 
 class Asset(str):
-    """Type of a field that names a file: `shipped`, or a path. Records hold the content's hash instead of the name."""
+    """Type of a field that names a file: `shipped`, or a path. Records hold the digest of the content, not the name."""
 
 
 @dataclass(frozen=True)

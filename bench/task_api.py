@@ -1,4 +1,4 @@
-"""Base class of tasks: what a trial is made of, how a task evaluates it, and how attacks are executed."""
+"""Base class of tasks, and their data: images with secret and release, the trial, and its outcome."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ class ExtractedImage:
 
     pixels: Callable[[], Bytes]  # (H, W, 3); read on demand
     secret: Features
-    foreground: Callable[[], Mask | None] = lambda: None  # (H, W) True where something hides the static scene, if that is known
-    notes: tuple[str, ...] = ()  # on how the image was read
+    foreground: Callable[[], Mask | None] = lambda: None  # (H, W) True where an object hides the static scene; None if unknown
+    notes: tuple[str, ...] = ()  # on the conversion of the image
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -55,14 +55,14 @@ class Trial:
     public: Public
     metrics: tuple[Metric, ...]
     rng: np.random.Generator
-    others: Callable[[int], Iterator[Release]]  # from a number to the first so many releases of other photographs
+    others: Callable[[int], Iterator[Release]]  # count -> the first `count` releases of other photographs
     repeats: tuple[Release, ...]  # further releases of the first image's features
     execute: Execute = execute_in_process
-    provenance: Mapping[str, Any] | None = None  # JSON: all that the releases are a function of; None disables the attack cache
+    provenance: Mapping[str, Any] | None = None  # JSON: all inputs of the releases; None disables the attack cache
 
     @property
     def secret(self) -> Features:
-        """The secret of the first image, which for most samples is the only one."""
+        """The secret of the first image. Most samples have one image."""
         return self.images[0].secret
 
     @property
@@ -85,40 +85,40 @@ class Outcome:
 
     metrics: Mapping[str, float | None]
     image: Floats | None = None  # (H, W, 3) in [0, 1], the reconstruction if there is one
-    estimates: Mapping[str, Any] = field(default_factory=dict)  # JSON: estimates that are no measures, such as a pose
+    estimates: Mapping[str, Any] = field(default_factory=dict)  # JSON: estimates other than metrics, such as a pose
     notes: tuple[str, ...] = ()
     saved_seconds: float = 0.0  # seconds that the attack cache saved
 
 
 class Task(Plugin, ABC):
-    """The measure of a release. The runner plans, resumes and records; a task evaluates one trial at a time."""
+    """A measure of releases or of attacks on them. A task evaluates one trial; the runner plans, resumes and records."""
 
-    judges_attacks: ClassVar[bool]  # whether it evaluates what an attack recovers, and not the release itself
-    needs_scene: ClassVar[bool] = False  # whether it is about a scene, also where none is named
-    needs_map: ClassVar[bool] = False  # whether it asks for the server's map
+    judges_attacks: ClassVar[bool]  # whether it evaluates the result of an attack, not the release itself
+    needs_scene: ClassVar[bool] = False  # whether its samples come from a scene; without a dataset it has a default scene
+    needs_map: ClassVar[bool] = False  # whether it uses the server's map
 
     @abstractmethod
     def collect(self, images: Images, dataset: Dataset | None) -> Collection:
-        """Return the samples of photographs or of a scene; of the built-in ones where neither is given.
+        """Return the samples of `images` or of `dataset`; if both are None, of the task's default.
 
         Raises
         ------
         UserError
-            if they are missing or damaged, or are not for this task.
+            if the input is missing or damaged, or the task does not accept it.
         """
 
     @abstractmethod
     def explain_not_applicable(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> str | None:
-        """Return why there is nothing to evaluate in that pair; None if there is."""
+        """Return the reason why the task cannot evaluate this pair; None if it can."""
 
     @abstractmethod
     def resolve(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> Mapping[str, Any]:
-        """Return digests of the other plugins and files that the attack would use, for its recorded configuration.
+        """Return digests of the other plugins and files that the attack uses, for its recorded configuration.
 
         Raises
         ------
         UserError
-            if something that it would use is missing or damaged.
+            if one of them is missing or damaged.
         """
 
     @abstractmethod
@@ -128,5 +128,5 @@ class Task(Plugin, ABC):
         Raises
         ------
         SampleError
-            if it cannot be done.
+            if the trial cannot be evaluated.
         """

@@ -1,10 +1,13 @@
-"""The contract of plugins as checks that raise AssertionError. Run them on your own plugin:
+"""Contract tests of plugins. Each function raises AssertionError if a plugin violates its contract.
 
+```python
 from bench.codebook.examples import draw_features, write_dictionary
+from bench.codebook.public import Public
 from bench.testing import check_defense
 
-def test_mine(tmp_path):
+def test_contract(tmp_path):
     check_defense(Mine(dictionary=write_dictionary(tmp_path)), Public(), draw_features())
+```
 """
 
 from __future__ import annotations
@@ -40,18 +43,22 @@ EMPTY_SAMPLE = Sample(name="made up", images=())
 
 
 def build_image(secret: Features, release: Release) -> ProtectedImage:
-    """Return features with their release, as those of a black photograph."""
+    """Return features and their release as an image. Its pixels are black."""
     return ProtectedImage(pixels=lambda: np.zeros((*secret.size[::-1], 3), np.uint8), secret=secret, release=release)
 
 
 def check_defense(defense: Defense, public: Public, secret: Features) -> None:
-    """A defense releases what it says, of the keypoints as they are, with all randomness from `rng` and no tie to the secret."""
+    """Check a defense.
+
+    The release has the declared type and the keypoints of the secret. All randomness comes from `rng`. The release shares no
+    memory with the secret, and the secret stays unchanged.
+    """
     before = copy.deepcopy(secret)
     release = defense.protect(secret, public, np.random.default_rng(1))
     assert type(release) is defense.releases, f"released {type(release).__name__}, declares {defense.releases.__name__}"
     assert are_equal(secret, before), "changed the secret"
     assert not _shared(release, secret), "the release shares memory with the secret"
-    assert np.array_equal(release.keypoints, secret.keypoints), "keypoints are released as they are"
+    assert np.array_equal(release.keypoints, secret.keypoints), "the released keypoints differ from the secret ones"
     assert release.size == secret.size
     _check_release(release, len(secret))
     assert are_equal(release, defense.protect(secret, public, np.random.default_rng(1))), "the same rng gave another release"
@@ -65,10 +72,10 @@ def check_defense(defense: Defense, public: Public, secret: Features) -> None:
 
 
 def check_applicability(attack: Attack, defense: Defense, extractor: Extractor, public: Public) -> bool:
-    """Whether an attack applies is stated, twice alike, and with a reason if not. Returns it."""
+    """Return whether an attack applies, and check that the answer is the same at each call and a refusal has a reason."""
     task = Reconstruction()
     reason = task.explain_not_applicable(defense, attack, extractor, public)
-    assert reason is None or reason.strip(), "an attack that does not apply says why"
+    assert reason is None or reason.strip(), "an attack that does not apply must return a reason"
     assert reason == task.explain_not_applicable(defense, attack, extractor, public)
     return reason is None
 
@@ -82,10 +89,11 @@ def check_attack(
     sample: Sample = EMPTY_SAMPLE,
     scene_index: SceneIndex | None = None,
 ) -> None:
-    """Check that an attack returns what its class declares, and reads the release and its declared knowledge alone.
+    """Check an attack.
 
-    Its result must be bit-identical when the secret and the caches are overwritten after the release, those on disk too. An
-    attack that needs the server's map is checked with a `sample` of the scene of `scene_index`.
+    The result has the type, shape and range that its class declares. The attack reads the release and its declared knowledge
+    alone. So its result is bit-identical if the secret and all caches, also those on disk, are overwritten after the release. For
+    an attack that needs the server's map, pass `scene_index` and a `sample` of its scene.
     """
     with tempfile.TemporaryDirectory() as folder, store.use_folder(Path(folder)):
         _check_attack(attack, defense, extractor, secret, sample, scene_index)
@@ -133,17 +141,17 @@ def _check_attack(
     for array in (*_arrays(mine), *quantised):
         array[...] = 0
     for entry in store.list_entries():
-        if entry.kind not in (maps.KIND, dictionary.KIND):  # which hold public data alone
+        if entry.kind not in (maps.KIND, dictionary.KIND):  # these two hold public data alone
             overwrite_with_zeros(entry.path, entry.kind)
     public.clear()
     assert np.array_equal(estimate, _estimate(trial)), "the attack saw more than the release"
 
 
 def check_metric(metric: Metric, seed: int = 0) -> None:
-    """A metric keeps its range, changes nothing, and prefers the truth to an estimate."""
+    """Check a metric: its values are in its range, it changes no argument, and the truth scores better than an estimate."""
     rng = np.random.default_rng(seed)
     if metric.compares == "images":
-        # Somebody's portrait, and noise that little is left of it under: a metric may have nothing to say of other pictures.
+        # A portrait under strong noise: a metric such as `face` has no value for a picture without a face.
         truth = (photographs.read(photographs.list_people()[0].path).pixels / 255).astype(np.float32)
         estimate = np.clip(truth + rng.normal(0, 0.5, truth.shape), 0, 1).astype(np.float32)
     else:
@@ -161,7 +169,7 @@ def check_metric(metric: Metric, seed: int = 0) -> None:
 
 
 def check_extractor(extractor: Extractor, image: np.ndarray, source: Path | None = None) -> None:
-    """An extractor gives unit descriptors at keypoints within the image, by position, and each time the same."""
+    """Check an extractor: unit descriptors at keypoints within the image, ordered by position, the same at each call."""
     before = image.copy()
     features = extractor.extract(image, source)
     assert np.array_equal(image, before)
@@ -174,18 +182,18 @@ def check_extractor(extractor: Extractor, image: np.ndarray, source: Path | None
     assert (features.keypoints <= features.size).all()
     np.testing.assert_allclose(np.linalg.norm(features.descriptors, axis=1), 1, atol=TOLERANCE)
     assert features.codes is None or arrays_equal(unit_rows(features.codes), features.descriptors)
-    assert are_equal(features, features.by_position()), "the order of keypoints would tell what is not released"
+    assert are_equal(features, features.by_position()), "the order of keypoints would reveal their strength: return by_position()"
 
 
 def overwrite_with_zeros(file: Path, kind: str) -> None:
-    """Put zeros in the place of all numbers of a file of arrays, as if they were what had been written."""
+    """Replace all numbers of a file of arrays by zeros, with a valid digest."""
     arrays, meta, _ = tensor_file.load(file, kind)
     tensor_file.save(file, kind, {name: np.zeros_like(array) for name, array in arrays.items()}, meta)
 
 
 def check_task(task: Task, defense: Defense, extractor: Extractor, secret: Features) -> None:
-    """A task without an attack gives finite numbers, each time the same, and changes nothing."""
-    assert not task.judges_attacks, "what an attack recovers is judged by reconstruction"
+    """Check a task that takes no attack: its metrics are finite and the same at each call, and it changes no argument."""
+    assert not task.judges_attacks, "check_task is for tasks that take no attack"
     public, before = Public(), copy.deepcopy(secret)
     release = defense.protect(secret, public, np.random.default_rng(1))
     released = copy.deepcopy(release)
@@ -209,7 +217,7 @@ def check_task(task: Task, defense: Defense, extractor: Extractor, secret: Featu
         return task.evaluate(trial)
 
     first = judged()
-    assert first.metrics, "judged nothing"
+    assert first.metrics, "the outcome has no metric"
     assert all(value is None or (isinstance(value, float) and np.isfinite(value)) for value in first.metrics.values())
     assert first.metrics == judged().metrics, "the same rng gave another outcome"
     assert are_equal(secret, before), "changed the secret"
@@ -217,25 +225,28 @@ def check_task(task: Task, defense: Defense, extractor: Extractor, secret: Featu
 
 
 def check_dataset(dataset: Dataset) -> None:
-    """A scene has images of different names, as large as their cameras say, the same each time, at finite poses."""
+    """Check a dataset.
+
+    Images have distinct names and contents, the size of their camera, and finite poses. They are the same at each call.
+    """
     scene, again = dataset.scene(), dataset.scene()
     images = (*scene.references, *scene.queries)
     assert images, "the scene is empty"
-    assert len({image.name for image in images}) == len(images), "two images have one name"
+    assert len({image.name for image in images}) == len(images), "two images have the same name"
     for image, other in zip(images, (*again.references, *again.queries), strict=True):
         pixels = image.pixels.read()
         assert pixels.dtype == np.uint8
-        assert pixels.shape == (image.camera.height, image.camera.width, 3), f"{image.name}: not as large as its camera says"
-        assert image.pixels.content_hash() == other.pixels.content_hash(), f"{image.name}: another image each time"
-        assert np.array_equal(pixels, other.pixels.read()), f"{image.name}: another image each time"
+        assert pixels.shape == (image.camera.height, image.camera.width, 3), f"{image.name}: its size is not that of its camera"
+        assert image.pixels.content_hash() == other.pixels.content_hash(), f"{image.name}: the second call gave another image"
+        assert np.array_equal(pixels, other.pixels.read()), f"{image.name}: the second call gave another image"
         assert image.cam_from_world is None or np.isfinite(image.cam_from_world.matrix()).all()
         mask = image.pixels.foreground()
         assert mask is None or mask.shape == pixels.shape[:2]
-    assert len({image.pixels.content_hash() for image in images}) == len(images), "two images have one content hash"
+    assert len({image.pixels.content_hash() for image in images}) == len(images), "two images have the same content hash"
 
 
 def are_equal(one: Any, other: Any) -> bool:
-    """Whether two dataclasses of arrays are equal bit for bit."""
+    """Return whether two dataclasses of arrays are equal bit for bit."""
     if isinstance(one, np.ndarray):
         return arrays_equal(one, other)
     if dataclasses.is_dataclass(one):
@@ -244,11 +255,12 @@ def are_equal(one: Any, other: Any) -> bool:
 
 
 def arrays_equal(one: np.ndarray, other: np.ndarray) -> bool:
+    """Return whether two arrays have the same type and equal values."""
     return one.dtype == other.dtype and np.array_equal(one, other)
 
 
 def _estimate(trial: Trial) -> Floats:
-    """Return what the attack recovers: an image, or descriptors of all keypoints or of those that it selects."""
+    """Return the result of the attack: an image, or descriptors of all or of the selected keypoints."""
     view, rng = build_view(trial), np.random.default_rng(3)
     if isinstance(trial.attack, DescriptorAttack):
         return trial.attack.recover(view, rng)

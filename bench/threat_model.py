@@ -1,6 +1,6 @@
-"""What an attacker may know beside the release, one class each.
+"""Knowledge of an attacker besides the release: one class for each kind.
 
-An attack lists classes in its `needs`, and `View.know(Class)` returns an object of that class. `bench run` fills them in.
+An attack lists the classes in its `needs`. `bench run` creates the objects, and `View.know(Class)` returns one.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class Knowledge:
-    """Base class of everything that an attack may ask for."""
+    """Base class of all kinds of knowledge."""
 
     description: ClassVar[str]  # for messages
 
@@ -46,12 +46,12 @@ class OtherReleases(Knowledge):
 
     description = "other releases made with the same database"
 
-    draw: Callable[[int], Iterator[Release]]  # from a number to the first so many releases
+    draw: Callable[[int], Iterator[Release]]  # count -> the first `count` releases
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RepeatedReleases(Knowledge):
-    """Further releases of the same photograph: as many as `Attack.repeats` says."""
+    """Further releases of the same photograph. `Attack.repeats` gives their number."""
 
     description = "further releases of the same photograph"
 
@@ -60,7 +60,7 @@ class RepeatedReleases(Knowledge):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PublicAssets(Knowledge):
-    """Dictionaries that everyone can read. An attack with a network trained on public photographs asks for this."""
+    """Public dictionaries. An attack with a network trained on public photographs declares this class, too."""
 
     description = "networks trained on public photographs, and public dictionaries"
 

@@ -1,6 +1,6 @@
 """The secret `Features`, and a `Release`: positions × descriptors.
 
-Shapes use N for keypoints, D for a descriptor's length, m for candidates a keypoint, dim for a subspace's dimension.
+Shapes use N for keypoints, D for the length of a descriptor, m for candidates per keypoint, dim for the dimension of a subspace.
 """
 
 from __future__ import annotations
@@ -18,26 +18,26 @@ Indices = NDArray[np.int64]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Features:
-    """Features that the phone extracted from one photograph: the only secret of the benchmark."""
+    """Features that the phone extracts from one photograph: the only secret of the benchmark."""
 
     keypoints: Floats  # (N, 2) x, y in pixels; the centre of the top-left pixel is (0.5, 0.5)
     descriptors: Floats  # (N, D) unit norm
-    codes: Bytes | None  # (N, D) the 8-bit vectors that the descriptors came from, where there are any
+    codes: Bytes | None  # (N, D) the 8-bit vectors of the descriptors; None if the extractor has none
     size: tuple[int, int]  # width, height in pixels
-    frames: Floats | None = None  # (N, 2) scale in pixels and orientation in radians, where the extractor reports them
+    frames: Floats | None = None  # (N, 2) scale in pixels and orientation in radians; None if the extractor has none
 
     def __len__(self) -> int:
         return len(self.keypoints)
 
     def by_position(self) -> Features:
-        """The same features from top to bottom, then from left to right.
+        """Return the same features from top to bottom, then from left to right.
 
-        Extractors find strong keypoints first, and strength is not released: in their order it would be.
+        Extractors return strong keypoints first. Their order would reveal the strength, which is not released.
         """
         return self.take(np.lexsort((self.keypoints[:, 0], self.keypoints[:, 1])))
 
     def take(self, rows: NDArray[Any]) -> Features:
-        """The features of some keypoints, in the order of `rows`: indices, or a mask."""
+        """Return the features of some keypoints, in the order of `rows`: indices, or a mask."""
         return Features(
             keypoints=self.keypoints[rows],
             descriptors=self.descriptors[rows],
@@ -49,10 +49,10 @@ class Features:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Positions:
-    """Where a release says that its keypoints are: a base class, one subclass for each kind."""
+    """Released positions of keypoints. Base class, with one subclass for each kind of release."""
 
     def __len__(self) -> int:
-        """The number of keypoints."""
+        """Return the number of keypoints."""
         raise NotImplementedError
 
     def take(self, rows: NDArray[Any]) -> Self:
@@ -75,10 +75,10 @@ class Points(Positions):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Release:
-    """What leaves the phone: positions × descriptors.
+    """The data that leave the phone: positions × descriptors.
 
-    The class says how descriptors are released, and the class of `positions` how positions are. Their number is released in the
-    clear.
+    The subclass defines the form of the descriptors. The class of `positions` defines the form of the positions. The number of
+    keypoints is always released in the clear.
     """
 
     positions: Positions
@@ -103,21 +103,22 @@ class Release:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Descriptors(Release):
-    """One descriptor a keypoint, and what else of it is released."""
+    """One descriptor per keypoint, and its scale and orientation if the defense releases them."""
 
     descriptors: Floats  # (N, D)
-    frames: Floats | None = None  # (N, 1) scale in pixels, or (N, 2) with orientation in radians, where they are released
+    frames: Floats | None = None  # (N, 1) scale in pixels, or (N, 2) with orientation in radians; None if not released
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Subspaces(Release):
-    """One affine subspace {origin + basisᵀ c} a keypoint."""
+    """One affine subspace {origin + basisᵀ c} per keypoint."""
 
     origins: Floats  # (N, D) a point of the subspace
     bases: Floats  # (N, dim, D) orthonormal rows
 
     @property
     def dim(self) -> int:
+        """Dimension of the subspaces."""
         return self.bases.shape[1]
 
     def take(self, rows: NDArray[Any]) -> Subspaces:
@@ -127,11 +128,12 @@ class Subspaces(Release):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class WordSets(Release):
-    """A set of m candidate descriptors a keypoint; the order of a row carries no information."""
+    """A set of m candidate descriptors per keypoint. The order within a row carries no information."""
 
     candidates: Floats  # (N, m, D) unit norm
-    words: Indices | None  # (N, m) rows of the dictionary, ascending; None where there is no dictionary
+    words: Indices | None  # (N, m) rows of the dictionary, ascending; None if there is no dictionary
 
     @property
     def subset_size(self) -> int:
+        """Number m of candidates per keypoint."""
         return self.candidates.shape[1]

@@ -1,7 +1,17 @@
-"""Affine subspace lifting (Dusmanu et al., CVPR 2021; the paper's Sec. 3).
+"""Affine subspace lifting: hides each descriptor in a random affine subspace, which may also contain words of a database.
 
-A descriptor d becomes D = d + span(d_1, ..., d_dim), where d_i = a_i − d for an adversarial descriptor a_i of the database,
-or d_i ~ U([-1, 1])^n. The release is a new origin and a new basis of D, computed from D and random vectors alone.
+Source: Dusmanu et al., CVPR 2021; the paper's Sec. 3.
+
+Method:
+
+1. Draw one of the sub-databases of W for the photograph.
+2. Choose dim directions for each descriptor d. A direction is d_i = a_i − d for a word a_i of the sub-database, or
+   d_i ~ U([-1, 1])^n. The words of one keypoint are distinct and are called its adversarial descriptors. The field `lifting` sets
+   their number: none ("random"), dim / 2 ("hybrid") or dim ("adversarial").
+3. The subspace is D = d + span(d_1, ..., d_dim).
+4. Release a new origin and a new basis of D, which are functions of D and of random vectors alone.
+
+Guarantee: none. D contains d and the words, which the attacks `database`, `lattice` and others find.
 """
 
 from __future__ import annotations
@@ -23,23 +33,23 @@ from bench.types import Bytes, Features, Floats, Indices, Points, Subspaces
 
 Doubles = NDArray[np.float64]
 
-# A direction adds no dimension if this fraction of its length, or less, lies outside the span of those before it.
+# A direction adds no dimension if at most this fraction of its length lies outside the span of the earlier directions.
 DEGENERATE_FRACTION = 1e-6
 MAX_DRAWS = 100
 
 
 @dataclass(frozen=True, kw_only=True)
 class Affine(Lifting):
-    """Releases a random affine subspace through the descriptor and, unless lifting=random, through words of a database.
+    """Releases a random affine subspace that contains the descriptor and, unless lifting=random, words of a database.
 
-    The adversarial words of a photograph come from one randomly drawn sub-database; the words of one keypoint are distinct.
+    The adversarial words of a photograph come from one randomly drawn sub-database. The words of one keypoint are distinct.
     """
 
     supported_settings: ClassVar[Mapping[str, Between | OneOf]] = {"dim": OneOf((2, 4, 6, 8, 10, 12, 14, 16))}
 
-    lifting: Literal["random", "adversarial", "hybrid"] = "hybrid"  # none, all or half of the directions point to words
-    dim: int = 4  # of the subspace
-    sub_databases: int = 16  # parts of the database
+    lifting: Literal["random", "adversarial", "hybrid"] = "hybrid"  # none, all or half of the directions lead to words
+    dim: int = 4  # dimension of the subspace
+    sub_databases: int = 16  # number of parts of the database, one of which a photograph uses
     database: Asset = Asset("shipped")
 
     def __post_init__(self) -> None:
@@ -48,7 +58,7 @@ class Affine(Lifting):
         if self.dim < 1:
             raise UserError(f"affine: dim must be at least 1, got {self.dim}")
         if self.lifting == "hybrid" and self.dim % 2:
-            raise UserError(f"affine: dim must be even where half of it is adversarial, got {self.dim}")
+            raise UserError(f"affine: dim must be even with lifting=hybrid, got {self.dim}")
         if self.sub_databases < 1:
             raise UserError(f"affine: sub_databases must be at least 1, got {self.sub_databases}")
 
@@ -71,7 +81,7 @@ class Affine(Lifting):
         return Privacy("none")
 
     def _draw_sub_database(self, length: int, public: Public, rng: np.random.Generator) -> tuple[int, Bytes]:
-        """Draw the sub-database of a photograph: its first row in the database, and its words (S, D)."""
+        """Draw the sub-database of a photograph. Returns its first row in the database, and its words (S, D)."""
         if self.adversarial == 0:
             return 0, np.empty((0, length), dtype=np.uint8)
         database = public.dictionary(self.database)
@@ -88,9 +98,19 @@ class Affine(Lifting):
 
 
 def lift(d: Doubles, words: Bytes, adversarial: int, dim: int, rng: np.random.Generator) -> tuple[Doubles, Indices]:
-    """Draw words and return orthonormal bases of D's directions, and the words. (N, D), (S, D) -> (N, dim, D), (N, adversarial)
+    """Draw the directions of each subspace. Returns orthonormal bases of their span, and the indices of the words.
 
-    Where the directions span fewer than `dim` dimensions, as when a word is the descriptor itself, all are drawn again.
+    If the directions span fewer than `dim` dimensions, all of them are drawn again. An example is a word that equals the
+    descriptor.
+
+    Parameters
+    ----------
+    d : (N, D) descriptors
+    words : (S, D) of the sub-database
+
+    Returns
+    -------
+    (N, dim, D) and (N, adversarial)
 
     Raises
     ------
@@ -109,7 +129,7 @@ def lift(d: Doubles, words: Bytes, adversarial: int, dim: int, rng: np.random.Ge
         directions[:, adversarial:] = rng.uniform(-1, 1, (len(waiting), dim - adversarial, length))
         lengths = np.linalg.norm(directions, axis=2)  # (waiting, dim)
         span[waiting], triangle = np.linalg.qr(directions.transpose(0, 2, 1))
-        gains = np.abs(np.diagonal(triangle, axis1=1, axis2=2))  # (waiting, dim) distance to the span of those before
+        gains = np.abs(np.diagonal(triangle, axis1=1, axis2=2))  # (waiting, dim) distance to the span of the earlier directions
         waiting = waiting[(gains <= DEGENERATE_FRACTION * lengths).any(axis=1)]
         if len(waiting) == 0:
             return span.transpose(0, 2, 1), indices
@@ -117,10 +137,11 @@ def lift(d: Doubles, words: Bytes, adversarial: int, dim: int, rng: np.random.Ge
 
 
 def reparameterise(d: Doubles, span: Doubles, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """Return a new origin and orthonormal basis of d + span, which depend on nothing else. -> (N, D), (N, dim, D)
+    """Return a new origin and a new orthonormal basis of D = d + span. -> (N, D), (N, dim, D)
 
-    The origin is the projection onto D of e_0, the basis that of e_1, ..., e_dim onto the directions of D, orthonormalised;
-    all e ~ U([-1, 1])^n. A projection onto D does not depend on the point and basis that describe D.
+    With random vectors e_i ~ U([-1, 1])^n, the origin is the projection of e_0 onto D. The basis is the projection of e_1,
+    ..., e_dim onto the directions of D, orthonormalised. Both depend on D and the e_i alone, because a projection onto D does
+    not depend on the point and the basis that describe D.
     """
     rows, dim, length = span.shape
     e = rng.uniform(-1, 1, (rows, 1 + dim, length))
@@ -128,7 +149,7 @@ def reparameterise(d: Doubles, span: Doubles, rng: np.random.Generator) -> tuple
     coordinates = e @ span.transpose(0, 2, 1)  # (N, 1 + dim, dim) of the projections in `span`
     origins = d + (coordinates[:, :1] @ span)[:, 0]
     mixing, triangle = np.linalg.qr(coordinates[:, 1:].transpose(0, 2, 1))  # (N, dim, dim) twice
-    # LAPACK's signs depend on `span`, and would reveal on which side of D the secret lies. Gram-Schmidt's do not.
+    # LAPACK's signs depend on `span` and would reveal on which side of D the secret lies. Gram-Schmidt's signs do not.
     mixing *= np.sign(np.diagonal(triangle, axis1=1, axis2=2))[:, None]
     bases = mixing.transpose(0, 2, 1) @ span
     return origins.astype(np.float32), bases.astype(np.float32)

@@ -1,19 +1,29 @@
-"""Exponential: words with a likelihood that grows with their similarity to the true one (McSherry and Talwar, FOCS 2007).
+"""Exponential mechanism: releases words that are likelier if they are more similar to the true word.
 
-The utility of a word w for the true word v, the one nearest to the descriptor, is their cosine: 0 up to `floor`, 1 at cosine 1,
-linear between, and rounded down to one of `levels` + 1 values. One word is drawn with
+Source: McSherry and Talwar, FOCS 2007; not in the paper.
 
-    Pr(w | v) = e^(ε u(v, w) / 2) / N(v),    N(v) = Σ_w e^(ε u(v, w) / 2).
+Method:
 
-*It is ε-LDP:* u lies in [0, 1], so e^(ε u(v, w) / 2) changes by at most the factor e^(ε / 2) from one v to another. So
-does each term of N, and hence N. The quotient of the two changes by at most e^ε. ∎ The factor 2 is due to normalisers that
-differ: `plateau` has equal ones and does not need it.
+1. Replace the descriptor by its nearest word v, the true word.
+2. The utility u(v, w) of a word w is a function of the cosine of v and w: 0 up to `floor`, 1 at cosine 1, and linear between.
+   It is rounded down to one of `levels` + 1 values.
+3. Draw one word with
 
-m words are drawn one at a time without replacement, with ε / m each. Given the earlier ones, each is this mechanism on fewer
-words, so the m of them compose to ε. The order of the draws is not released.
+       Pr(w | v) = e^(ε u(v, w) / 2) / N(v),    N(v) = Σ_w e^(ε u(v, w) / 2).
 
-The proof does not depend on the rounding of u, as long as u is a function of v and w. Here it is a function of integers, the same
-on every machine (`bench.geometry.neighbours`). The draw is exact (`bench.mechanisms.graded`): one pass over the dictionary.
+4. For m = `subset_size` words, draw one word at a time without replacement, with ε / m each. The order of the draws is not
+   released.
+
+*It is ε-LDP:* u lies in [0, 1], so e^(ε u(v, w) / 2) changes by at most the factor e^(ε / 2) from one v to another. So does
+each term of N, and hence N. The quotient of the two changes by at most e^ε. ∎ Given the earlier draws, each of m draws is
+this mechanism on fewer words, so m draws compose to ε.
+
+Limits: the factor 2 in the exponent is due to normalisers N(v) that differ between words. `plateau` has equal normalisers and
+does not need it.
+
+Exactness: the proof holds for any u that is a function of v and w, so u may be rounded. u is computed from integers and is
+the same on every machine (`bench.geometry.neighbours`). The draw is exact (`bench.mechanisms.graded`): one pass over the
+dictionary.
 """
 
 from __future__ import annotations
@@ -38,7 +48,7 @@ from bench.types import Features, Points, WordSets
 
 @dataclass(frozen=True, kw_only=True)
 class Exponential(Defense):
-    """Releases words with a likelihood that grows with their cosine with the descriptor's nearest word."""
+    """Releases words whose probability grows with their cosine with the descriptor's nearest word."""
 
     releases = WordSets
     supported_settings: ClassVar[Mapping[str, Between | OneOf]] = {"epsilon": Between(8.0, 32.0), "words": OneOf((0, 128_000))}
@@ -47,8 +57,8 @@ class Exponential(Defense):
 
     epsilon: float = 10.0  # nats, per descriptor
     subset_size: int = 1  # words released per keypoint, each with epsilon / subset_size
-    floor: float = 0.8  # the greatest cosine of utility 0; most words are below it
-    levels: int = 8  # of utility, besides 0
+    floor: float = 0.8  # greatest cosine of utility 0; the cosine of most words is less
+    levels: int = 8  # number of utilities above 0
     dictionary: Asset = Asset("shipped")
     words: int = 0  # number of the dictionary's first words to use; 0 is all
 
@@ -65,7 +75,7 @@ class Exponential(Defense):
     def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> WordSets:
         dictionary = self._load_dictionary(public)
         true = public.nearest_words(self.dictionary, secret, self.words)  # (N,)
-        # Rounding may put a word's cosine with itself below 1.
+        # By rounding, the cosine of a word with itself may be less than 1.
         borders = self.floor + (1 - self.floor) * np.arange(1, self.levels + 1) / self.levels - 1e-9
         powers = [to_fraction(self.epsilon) * level / (2 * self.levels * self.subset_size) for level in range(self.levels + 1)]
         words = draw_graded_words(dictionary.neighbours, true, borders, powers, self.subset_size, rng)
@@ -74,7 +84,7 @@ class Exponential(Defense):
 
     def privacy(self, public: Public) -> Privacy:
         self._load_dictionary(public)
-        return Privacy("epsilon-ldp", self.epsilon)  # the chance of the true word differs between words
+        return Privacy("epsilon-ldp", self.epsilon)  # the probability of the true word differs between words
 
     def _load_dictionary(self, public: Public) -> Dictionary:
         """Load the dictionary and check that it has enough words."""

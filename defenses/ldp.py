@@ -1,8 +1,21 @@
-"""LDP-Feat: the ω-subset mechanism on a dictionary of descriptors (Sec. 5.2, Steps 1 to 3; Eq. (5); Theorem 1).
+"""LDP-Feat: the ω-subset mechanism on a dictionary of descriptors.
+
+Source: the paper's Sec. 5.2, Steps 1 to 3; Eq. (5); Theorem 1.
+
+Method, for a dictionary K and a subset size m:
+
+1. Replace the descriptor by its nearest word d'.
+2. Draw u = 1 with probability m e^ε / (m e^ε + |K| − m).
+3. Draw m − u words without replacement from K − {d'}, and add d' if u = 1. Release the set in sorted order: another order could
+   reveal the true word.
+
+Guarantee: ε-LDP of one descriptor. `bench.mechanisms.subset` states the theorem and samples it exactly.
 
 With `memoize`, one answer is drawn for each word of the dictionary, and a device always sends that answer for the word. All
-releases of a device are then a function of its table of answers, so a word costs ε once, regardless of the number of releases. In
-return, equal words are visibly equal within and across photographs, which no ε covers (docs/guarantee.md).
+releases of a device are then a function of its table of answers. So a word costs ε once, regardless of the number of releases. In
+return, equal words are visibly equal within and across photographs. No ε covers this (docs/guarantee.md).
+
+Limits: ε is per descriptor, so the keypoints of one image compose. Positions are released in the clear.
 """
 
 from __future__ import annotations
@@ -28,7 +41,7 @@ from bench.types import Features, Points, WordSets
 class LDP(Defense):
     """Releases a random set of words that contains the descriptor's nearest word with a probability set by epsilon.
 
-    `epsilon=inf` always releases the nearest word, with `subset_size` - 1 random ones: quantisation without a guarantee.
+    `epsilon=inf` always releases the nearest word, with `subset_size` - 1 random ones. This is quantisation without a guarantee.
     """
 
     releases = WordSets
@@ -44,7 +57,7 @@ class LDP(Defense):
     subset_size: int = 2  # words released per keypoint
     dictionary: Asset = Asset("shipped")
     words: int = 0  # number of the dictionary's first words to use; 0 is all
-    memoize: bool = False  # whether a word always gets the same answer on one device
+    memoize: bool = False  # whether one device always sends the same set for a word
 
     def __post_init__(self) -> None:
         if not self.epsilon >= 0:  # NaN is refused too
@@ -57,7 +70,7 @@ class LDP(Defense):
     def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> WordSets:
         dictionary = self._load_dictionary(public)
         nearest = public.nearest_words(self.dictionary, secret, self.words)  # (N,) d'
-        # A memoized defense draws its answers to all words, regardless of the features.
+        # A memoized defense draws the answers for all words, regardless of the features.
         inputs = np.arange(len(dictionary)) if self.memoize else nearest
         answers = draw_word_subsets(inputs, len(dictionary), self.epsilon, self.subset_size, rng)
         words = answers[nearest] if self.memoize else answers  # (N, m)

@@ -1,22 +1,27 @@
-"""Metric LDP: d_χ-privacy over words (Chatzikokolakis et al., PETS 2013; for embeddings Feyisetan et al., WSDM 2020).
+"""Metric LDP: d_χ-privacy over words, by which two descriptors are protected against each other according to their distance.
 
-A different guarantee than ε-LDP: the protection of two descriptors against each other depends on their distance.
-With ε in nats *per unit of distance*,
+Source: Chatzikokolakis et al., PETS 2013; for embeddings Feyisetan et al., WSDM 2020; not in the paper.
+
+Guarantee: this is not ε-LDP. With ε in nats *per unit of distance*,
 
     Pr(w | v1) ≤ e^(ε d(v1, v2)) Pr(w | v2)    for all words w, and v1, v2 the words nearest to the two descriptors.
 
-Similar descriptors are hidden among each other. Whether a descriptor is of one kind or another is hidden no better than the
-distance between the kinds allows. The greatest distance is √2, that of SIFT descriptors with no direction in common. Values of ε
-in nats and in nats per distance are not comparable.
+Similar descriptors are hard to distinguish. Descriptors of different kinds can be distinguished as far as ε times their
+distance allows. The greatest distance is √2, that of SIFT descriptors with no direction in common. Values of ε in nats and in
+nats per distance are not comparable.
 
-One word is drawn, with Pr(w | v) = e^(−ε d(v, w) / 2) / N(v). d is the distance of the unit words, rounded up to a multiple of
-1/`steps`. It is a metric: rounding up preserves zero and order, and ⌈a + b⌉ ≤ ⌈a⌉ + ⌈b⌉.
+Method:
 
-*Proof.* |d(v1, w) − d(v2, w)| ≤ d(v1, v2), so numerators differ by at most the factor e^(ε d(v1, v2) / 2), and so do the
-terms of N, and N. The quotient differs by at most e^(ε d(v1, v2)). ∎
+1. Replace the descriptor by its nearest word v.
+2. d(v, w) is the distance of the unit words, rounded up to a multiple of 1/`steps`. It is a metric: rounding up preserves
+   zero and order, and ⌈a + b⌉ ≤ ⌈a⌉ + ⌈b⌉.
+3. Draw one word with Pr(w | v) = e^(−ε d(v, w) / 2) / N(v).
 
-Distances are computed from integers, to within `SLACK`. The metric of the guarantee is the distance plus 2 `SLACK`, rounded up:
-this covers distances that rounding puts on the wrong side of a step. The draw is exact (`bench.mechanisms.graded`).
+*Proof.* |d(v1, w) − d(v2, w)| ≤ d(v1, v2), so numerators differ by at most the factor e^(ε d(v1, v2) / 2). So do the terms of
+N, and hence N. The quotient differs by at most e^(ε d(v1, v2)). ∎
+
+Exactness: distances are computed from integers, to within `SLACK`. The metric of the guarantee is the distance plus 2 `SLACK`,
+rounded up. This covers distances that rounding puts on the wrong side of a step. The draw is exact (`bench.mechanisms.graded`).
 """
 
 from __future__ import annotations
@@ -38,14 +43,14 @@ from bench.mechanisms.graded import draw_graded_words
 from bench.settings import Asset, Between, OneOf
 from bench.types import Features, Points, WordSets
 
-SLACK = 2e-6  # of distance: cosines are off by 1e-15, and cosines nearer to 1 than ZERO_TOLERANCE have distance zero
+SLACK = 2e-6  # error of a distance: cosines are off by 1e-15, and cosines nearer to 1 than ZERO_TOLERANCE have distance zero
 ZERO_TOLERANCE = 1e-12
 FARTHEST = 2  # greatest distance of unit vectors
 
 
 @dataclass(frozen=True, kw_only=True)
 class MetricLDP(Defense):
-    """Releases a word with a likelihood that falls with its distance to the descriptor's nearest word."""
+    """Releases a word whose probability falls with its distance to the descriptor's nearest word."""
 
     releases = WordSets
     supported_settings: ClassVar[Mapping[str, Between | OneOf]] = {"epsilon": Between(10.0, 80.0), "words": OneOf((0, 128_000))}
@@ -53,7 +58,7 @@ class MetricLDP(Defense):
     word_count_field: ClassVar[str | None] = "words"
 
     epsilon: float = 16.0  # nats per unit of distance between unit descriptors
-    steps: int = 16  # per unit of distance
+    steps: int = 16  # number of rounded distances per unit of distance
     dictionary: Asset = Asset("shipped")
     words: int = 0  # number of the dictionary's first words to use; 0 is all
 

@@ -1,10 +1,16 @@
-"""Naive LDP: the ω-subset mechanism on the full descriptor space (Sec. 5.2, "Naive Approach").
+"""Naive LDP: the ω-subset mechanism on the full descriptor space.
 
-K is the set of all bit patterns of a descriptor: |K| = 2^(8·128) for uint8, 2^(32·128) for float32. The mechanism draws
-patterns. Reading them as descriptors is post-processing and costs no privacy.
+Source: the paper's Sec. 5.2, "Naive Approach".
 
-Rule for patterns that are no descriptor: a component that is NaN or infinite is read as 0; the row is then scaled to unit
-norm in float64; a row of zeros stays zero.
+Method: K is the set of all bit patterns of a descriptor, with |K| = 2^(8·128) for uint8 and 2^(32·128) for float32. The mechanism
+draws m patterns, as `ldp` draws words. Reading the patterns as descriptors is post-processing and costs no privacy.
+
+Rule for patterns that are not descriptors: a component that is NaN or infinite is read as 0. The row is then scaled to unit
+norm in float64. A row of zeros stays zero.
+
+Guarantee: ε-LDP of one descriptor.
+
+Limits: |K| is so large that the descriptor's own pattern is almost never released.
 """
 
 from __future__ import annotations
@@ -22,13 +28,13 @@ from bench.geometry.nearest_words import unit_rows
 from bench.mechanisms.subset import draw_pattern_subsets, log10_chance
 from bench.types import Bytes, Features, Floats, Points, WordSets
 
-LENGTH = 128  # of a descriptor; |K| depends on it
+LENGTH = 128  # components of a descriptor; |K| depends on it
 BITS = {"uint8": 8, "float32": 32}
 
 
 @dataclass(frozen=True, kw_only=True)
 class NaiveLDP(Defense):
-    """Releases a random set of bit patterns, almost never the descriptor's own."""
+    """Releases a random set of bit patterns, which almost never contains the descriptor's own pattern."""
 
     releases = WordSets
 
@@ -62,12 +68,12 @@ class NaiveLDP(Defense):
         if self.element == "float32":
             return secret.descriptors.astype("<f4").view(np.uint8)
         if secret.codes is None:
-            raise UserError("naive-ldp: these features are floats without 8-bit codes; use element=float32")
+            raise UserError("naive-ldp: these features have no 8-bit codes; use element=float32")
         return secret.codes
 
 
 def read_finite_floats(patterns: Bytes) -> Floats:
-    """Read patterns as float32, NaN and infinities as 0. (N, m, 4 D) -> (N, m, D)"""
+    """Return the patterns read as float32, with NaN and infinities as 0. (N, m, 4 D) -> (N, m, D)"""
     values = patterns.view("<f4")
     return np.where(np.isfinite(values), values, np.float32(0))
 

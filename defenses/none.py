@@ -1,4 +1,4 @@
-"""No defense: the upper bound of every attack, the paper's rows "Raw"."""
+"""No defense: releases the descriptors unchanged. The upper bound of every attack, the paper's rows "Raw"."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from bench.codebook.public import Public
 from bench.core.errors import UserError
 from bench.types import Descriptors, Features, Floats, Points
 
-COLUMNS = {"positions": 0, "scale": 1, "scale-and-orientation": 2}  # of `Features.frames`
+COLUMNS = {"positions": 0, "scale": 1, "scale-and-orientation": 2}  # number of columns of `Features.frames` that are sent
 
 
 @dataclass(frozen=True, kw_only=True)
 class Undefended(Defense):
     """Releases the descriptors unchanged.
 
-    Clients may send more of a keypoint than its position: COLMAP's and hloc's files carry scale and orientation.
+    Some clients send the scale and the orientation of a keypoint as well, as the files of COLMAP and hloc do (`sends`).
     """
 
     releases = Descriptors
 
-    sends: Literal["positions", "scale", "scale-and-orientation"] = "positions"  # of a keypoint
+    sends: Literal["positions", "scale", "scale-and-orientation"] = "positions"  # data sent of each keypoint
 
     def __post_init__(self) -> None:
         if self.sends not in COLUMNS:
@@ -43,7 +43,7 @@ class Undefended(Defense):
         if columns == 0:
             return None
         if secret.frames is None:
-            raise UserError(f"none: sends={self.sends}, but the extractor does not provide it")
+            raise UserError(f"none: sends={self.sends}, but the extractor does not provide scale and orientation")
         return secret.frames[:, :columns].copy()
 
     def privacy(self, public: Public) -> Privacy:

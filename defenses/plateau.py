@@ -1,20 +1,26 @@
-"""Plateau: a set of words that is likelier, by e^ε, if it contains the true word or one of its nearest words.
+"""Plateau: releases a set of words that is likelier, by e^ε, if it contains the true word or a word near it.
 
-Let T(v) be the t words nearest to v, itself among them, and v the word nearest to the descriptor. Of all sets Z of m words,
+Source: not in the paper.
 
-    Pr(Z | v) = e^ε / (A e^ε + B)   if Z and T(v) share a word,             A = C(|K|, m) − C(|K| − t, m) sets,
-    Pr(Z | v) = 1   / (A e^ε + B)   if they do not,                         B = C(|K| − t, m) sets.
+Method: let v be the word nearest to the descriptor. Let T(v) be the t words nearest to v, including v itself. Of all sets Z of m
+words, draw one with
 
-*It is ε-LDP:* t is the same for all v, and so are A and B; the only two values differ by the factor e^ε. T(v)
-is a function of v, and v one of the descriptor, so the same bound holds for descriptors. ∎ With t = 1 this is exactly `ldp`.
+    Pr(Z | v) = e^ε / (A e^ε + B)   if Z and T(v) share a word; there are A = C(|K|, m) − C(|K| − t, m) such sets,
+    Pr(Z | v) = 1   / (A e^ε + B)   if they do not; there are B = C(|K| − t, m) such sets.
 
-The other words of an ω-subset are drawn uniformly. Here the words near the true one are as likely as it is. Where p is small,
-each is released nearly as often as the true one by `ldp`: with m t e^ε well below |K|, t costs the true word little; where p is
-large, much. A server may quantise the same descriptor to a near word later; for an attacker, a near word is almost as useful as
-the true one. docs/better.md measures both.
+*It is ε-LDP:* t is the same for all v, and so are A and B. The only two values differ by the factor e^ε. T(v) is a function of v,
+and v is a function of the descriptor, so the same bound holds for descriptors. ∎ With t = 1 this is exactly `ldp`.
 
-The sampling is exact. Whether Z and T(v) share a word is drawn as u in `ldp`, with the integers A + B and A for |K| and m; then
-the number j of shared words, of C(t, j) C(|K| − t, m − j) sets each; then subsets of both, without replacement. Rows are sorted.
+Comparison with `ldp`, which draws the other words uniformly: here each of the t − 1 near words is as likely as the true one.
+With m t e^ε well below |K|, the true word is released nearly as often as by `ldp`. With m e^ε near |K| or above, it is
+released much less often. A near word helps a server only if the map's descriptor of that point is quantised to it. For an
+attacker, a near word is almost as useful as the true one.
+
+Exactness: each step of the sampling is exact.
+
+1. Draw whether Z and T(v) share a word. This is the draw of u in `ldp`, with the integers A + B and A for |K| and m.
+2. Draw the number j of shared words. There are C(t, j) C(|K| − t, m − j) sets for each j.
+3. Draw j words of T(v) and m − j of the others, without replacement. Rows are sorted.
 """
 
 from __future__ import annotations
@@ -40,7 +46,7 @@ from bench.types import Features, Indices, Points, WordSets
 
 @dataclass(frozen=True, kw_only=True)
 class Plateau(Defense):
-    """Releases a random set of words, likelier if it contains the descriptor's nearest word or a word near that one."""
+    """Releases a random set of words that is likelier if it contains the descriptor's nearest word or a word near that one."""
 
     releases = WordSets
     supported_settings: ClassVar[Mapping[str, Between | OneOf]] = {
@@ -54,7 +60,7 @@ class Plateau(Defense):
 
     epsilon: float = 10.0  # nats, per descriptor
     subset_size: int = 2  # words released per keypoint
-    near: int = 4  # words of the plateau, including the true one
+    near: int = 4  # t, the number of words in T(v), including the true one
     dictionary: Asset = Asset("shipped")
     words: int = 0  # number of the dictionary's first words to use; 0 is all
 
@@ -78,7 +84,7 @@ class Plateau(Defense):
     def privacy(self, public: Public) -> Privacy:
         domain = len(self._load_dictionary(public))
         intersecting = _count_intersecting_sets(domain, self.near, self.subset_size)
-        fraction = Fraction(math.comb(domain - 1, self.subset_size - 1), intersecting)  # of these sets, with the true word
+        fraction = Fraction(math.comb(domain - 1, self.subset_size - 1), intersecting)  # of these sets that contain the true word
         log10_true = log10_chance(self.epsilon, math.comb(domain, self.subset_size), intersecting) + math.log10(fraction)
         if math.isinf(self.epsilon):
             return Privacy("none", log10_true=log10_true)
@@ -95,14 +101,14 @@ class Plateau(Defense):
 
 
 def _count_intersecting_sets(domain: int, near: int, size: int) -> int:
-    """Return A, the number of sets of `size` words with a word of the plateau."""
+    """Return A, the number of sets of `size` words that share a word with T(v)."""
     return math.comb(domain, size) - math.comb(domain - near, size)
 
 
 def draw_plateau_subsets(plateaus: Indices, domain: int, epsilon: float, size: int, rng: np.random.Generator) -> Indices:
-    """The mechanism on K = {0, ..., domain − 1}. plateaus: (N, t), rows ascending -> (N, m), rows ascending"""
+    """Draw sets of the mechanism on K = {0, ..., domain − 1}. plateaus T(v): (N, t), rows ascending -> (N, m), rows ascending"""
     rows, near = plateaus.shape
-    shared = np.zeros(rows, dtype=np.int64)  # words of the plateau in each set
+    shared = np.zeros(rows, dtype=np.int64)  # number of words of T(v) in each set
     intersecting = draw_inclusion(rows, epsilon, math.comb(domain, size), _count_intersecting_sets(domain, near, size), rng)
     ways = [math.comb(near, j) * math.comb(domain - near, size - j) for j in range(1, min(near, size) + 1)]
     shared[intersecting] = 1 + draw_classes([ways], [Fraction(0)] * len(ways), np.zeros(intersecting.sum(), dtype=np.int64), rng)

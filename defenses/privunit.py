@@ -1,26 +1,30 @@
-"""PrivUnit: a unit vector that is likelier, by e^ε, within a cap around the descriptor (Bhowmick et al., arXiv:1812.00984).
+"""PrivUnit: releases a unit vector that is likelier, by e^ε, within a cap around the descriptor.
 
-Let u be a unit vector of S^(n − 1), and q the fraction of the sphere that the cap {v: v·u ≥ γ} covers. With probability
+Source: Bhowmick et al., arXiv:1812.00984; not in the paper.
+
+Method: let u be a unit vector of S^(n − 1), and q the fraction of the sphere that the cap {v: v·u ≥ γ} covers. With probability
 
     p = q e^ε / (q e^ε + 1 − q)
 
-v is uniform on the cap, else on the rest. Its density, relative to the uniform one, is
+v is uniform on the cap, otherwise on the rest of the sphere. Its density, relative to the uniform density, is
 
     p / q             = e^ε / (q e^ε + 1 − q)    within the cap,
     (1 − p) / (1 − q) = 1   / (q e^ε + 1 − q)    outside.
 
-*It is ε-LDP:* all caps of one γ cover the same fraction, so the two densities are the same for all u. They are the only ones
-and differ by the factor e^ε. ∎ Spending all of ε on this quotient, and choosing γ so that the mean of v·u is greatest, is
-optimal among all unbiased mechanisms (Asi, Feldman and Talwar, ICML 2022); the original splits ε in two. `plateau` is the
-analogue for words.
+*It is ε-LDP:* all caps of one γ cover the same fraction, so the two densities are the same for all u. They are the only
+values and differ by the factor e^ε. ∎
 
-Descriptors are non-negative and cluster around their mean. With `centred`, u is the component of the descriptor orthogonal to the
-mean direction of a public dictionary, and n is one less. It is a function of the descriptor, so the proof still holds.
+Choice of γ: this file spends all of ε on that quotient, and chooses the γ with the greatest mean of v·u. This is optimal
+among all unbiased mechanisms (Asi, Feldman and Talwar, ICML 2022). The original splits ε in two. `plateau` is the analogue
+for words.
 
-The coin is exact, with q a multiple of 2^-64 (`bench.mechanisms.subset`). The vector is not: a sphere has no exact draw. γ and
-the projection are doubles, with a relative error of the densities of about 1e-12. Each component is rounded to a multiple of
-2^-12 before it is scaled to unit norm. This removes the bits in which sums of doubles reveal their summands (Mironov, CCS 2012).
-So ε holds as far as doubles represent real numbers, whereas mechanisms over words are exact.
+Centring: descriptors are non-negative and cluster around their mean. With `centred`, u is the component of the descriptor
+orthogonal to the mean direction of a public dictionary, and n is one less. u is a function of the descriptor, so the proof holds.
+
+Limits: the coin is exact, with q a multiple of 2^-64 (`bench.mechanisms.subset`). The vector is not, since a sphere has no exact
+draw. γ and the projection are doubles, with a relative error of the densities of about 1e-12. Each component is rounded to a
+multiple of 2^-12 before the vector is scaled to unit norm. This removes the bits in which sums of doubles reveal their summands
+(Mironov, CCS 2012). So ε holds as far as doubles represent real numbers, whereas mechanisms over words are exact.
 """
 
 from __future__ import annotations
@@ -44,13 +48,13 @@ from bench.types import Descriptors, Features, Points
 
 Doubles = NDArray[np.float64]
 
-BINARY_DIGITS = 64  # of q
-GRID = 2.0**-12  # of the released components, before scaling
+BINARY_DIGITS = 64  # binary digits of q
+GRID = 2.0**-12  # released components are multiples of it, before they are scaled
 
 
 @dataclass(frozen=True, kw_only=True)
 class PrivUnit(Defense):
-    """Releases a unit vector, likelier in a cap around the descriptor."""
+    """Releases a random unit vector that is likelier within a cap around the descriptor."""
 
     releases = Descriptors
     supported_settings: ClassVar[Mapping[str, Between | OneOf]] = {"epsilon": Between(4.0, 32.0)}
@@ -75,14 +79,14 @@ class PrivUnit(Defense):
 
 
 def remove_mean(rows: Doubles, mean: Doubles | None) -> Doubles:
-    """Return unit vectors along the component of each row orthogonal to the mean. (N, D), (1, D) -> (N, D)"""
+    """Return the component of each row orthogonal to the mean, scaled to unit norm. (N, D), (1, D) -> (N, D)"""
     if mean is not None:
         rows = rows - (rows @ mean.T) * mean
     return rows / np.linalg.norm(rows, axis=1, keepdims=True)
 
 
 def draw_near(u: Doubles, mean: Doubles | None, epsilon: float, rng: np.random.Generator) -> Doubles:
-    """Draw from the mechanism, on the sphere orthogonal to the mean. (N, D), (1, D) -> (N, D)"""
+    """Draw a vector of the mechanism for each u, on the sphere orthogonal to the mean. (N, D), (1, D) -> (N, D)"""
     rows, length = u.shape
     free = length - (mean is not None)  # n
     covered = choose_cap(epsilon, free)
@@ -96,7 +100,10 @@ def draw_near(u: Doubles, mean: Doubles | None, epsilon: float, rng: np.random.G
 
 
 def latitude(fraction: Doubles, length: int) -> Doubles:
-    """The cosine with this fraction of S^(n − 1) beyond it: (1 + v·u) / 2 is Beta((n − 1)/2, (n − 1)/2). (N,) -> (N,)"""
+    """Return the cosine that a fraction of S^(n − 1) exceeds. (N,) -> (N,)
+
+    For uniform v, (1 + v·u) / 2 has the distribution Beta((n − 1)/2, (n − 1)/2).
+    """
     from scipy.special import betaincinv
 
     half = (length - 1) / 2
@@ -107,8 +114,8 @@ def latitude(fraction: Doubles, length: int) -> Doubles:
 def choose_cap(epsilon: float, length: int) -> int:
     """Return 2^64 q for the cap with the greatest mean of v·u.
 
-    The part of v·u's mean beyond γ is c = (1 − γ²)^((n − 1)/2) / ((n − 1) B(1/2, (n − 1)/2)) under the uniform
-    density, and the part before it −c. So the mean is c (e^ε − 1) / (q e^ε + 1 − q).
+    Under the uniform density, the cap contributes c = (1 − γ²)^((n − 1)/2) / ((n − 1) B(1/2, (n − 1)/2)) to the mean of v·u, and
+    the rest of the sphere contributes −c. So the mean of the mechanism is c (e^ε − 1) / (q e^ε + 1 − q).
     """
     from scipy.optimize import minimize_scalar
     from scipy.special import betainc
@@ -125,7 +132,7 @@ def choose_cap(epsilon: float, length: int) -> int:
 
 
 def expected_cosine(epsilon: float, length: int) -> float:
-    """The mean of v·u."""
+    """Return the mean of v·u for the cap of `choose_cap`."""
     from scipy.special import betaln
 
     q, half = choose_cap(epsilon, length) / 2**BINARY_DIGITS, (length - 1) / 2

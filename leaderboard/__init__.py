@@ -1,1 +1,1 @@
-"""Statistics, tables, plots and pages, from records alone."""
+"""Statistics, tables, plots and pages, computed from records alone."""

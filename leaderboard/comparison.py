@@ -1,9 +1,9 @@
 """Comparison groups of records: experiments whose numbers can be compared.
 
-The experiments of a group share schema, task with its settings, dataset, extractor, metric settings and source code. A dataset is
-identified by its content, so that another split is another dataset. Each seed has its own group. The experiments that have all
-seeds share one more group, where each sample counts with its mean over the seeds. Runs of one experiment in several environments
-stay separate.
+The experiments of a group share the schema, the task with its settings, the dataset, the extractor, the metric settings and the
+source code. A dataset is identified by its content, so another split is another dataset. Each seed has its own group. The
+experiments that have all seeds form one more group, where each sample counts with its mean over the seeds. Runs of one experiment
+in several environments stay separate.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class LocatedRecord:
-    """A record, and the folder that holds it and its images."""
+    """A record, and the folder of its file and its images."""
 
     record: Record
     folder: Path
@@ -36,7 +36,7 @@ class LocatedRecord:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GroupedExperiment:
-    """One defense against one attack, or alone where the task takes no attack, with the records of all samples and seeds."""
+    """One experiment with the records of all its samples and seeds. `attack` is "none needed" if the task takes no attack."""
 
     defense: str  # labels
     attack: str
@@ -44,17 +44,17 @@ class GroupedExperiment:
 
     @property
     def metadata(self) -> Record:
-        """The first record, for the fields that all of them share."""
+        """The first record, for the fields that are equal in all records."""
         return self.records[0].record
 
     @property
     def key(self) -> str:
-        """Identifies the experiment among those of all groups."""
+        """An identifier of the experiment, unique over all groups."""
         return short_hash(sorted({located.record["run_hash"] for located in self.records}))
 
     @property
     def reason(self) -> str | None:
-        """Why the experiment does not apply, or None."""
+        """The reason why the experiment does not apply, or None."""
         return self.metadata["reason"] if self.metadata["status"] == "n/a" else None
 
     @functools.cached_property
@@ -80,9 +80,9 @@ class ComparisonGroup:
 
     experiments: tuple[GroupedExperiment, ...]
     seeds: tuple[int, ...]
-    samples: tuple[str, ...]  # those that some experiment has completed, in the order of the records
+    samples: tuple[str, ...]  # samples that at least one experiment has completed, in the order of the records
     conditions: tuple[str | None, ...]  # such as day and night; (None,) where samples have none
-    measures: tuple[Measure, ...]  # those that some record has a value of
+    measures: tuple[Measure, ...]  # measures with a value in at least one record
 
     @property
     def metadata(self) -> Record:
@@ -90,7 +90,7 @@ class ComparisonGroup:
 
     @property
     def key(self) -> str:
-        """Identifies the group."""
+        """An identifier of the group."""
         return short_hash([_comparison_key(self.metadata), self.seeds])
 
     @property
@@ -105,7 +105,7 @@ class ComparisonGroup:
 
     @property
     def facts(self) -> list[str]:
-        """What all numbers of the group share."""
+        """The facts that hold for all numbers of the group."""
         seeds = ", ".join(map(str, self.seeds))
         return [
             f"{len(self.samples)} {name_samples(self.metadata['task'], len(self.samples))}",
@@ -126,17 +126,17 @@ class ComparisonGroup:
         return [records for records in experiment.by_sample if len(records) == len(self.seeds)]
 
     def list_values(self, experiment: GroupedExperiment, metric: str, condition: str | None = None) -> list[float | None]:
-        """Return the value of each such sample, averaged over the seeds; for one condition if it is given."""
+        """Return a metric of each complete sample, averaged over the seeds. A condition selects the samples of that condition."""
         samples = self.complete_samples(experiment)
         selection = [records for records in samples if condition is None or records[0].get("condition") == condition]
         return [_mean([record["metrics"].get(metric) for record in records]) for records in selection]
 
     def average(self, experiment: GroupedExperiment, measure: Measure, condition: str | None = None) -> Interval | None:
-        """Return the measure's average over the samples; None where there is nothing to average."""
+        """Return the measure's average over the samples; None if no sample has a value."""
         return summarize(measure, self.list_values(experiment, measure.name, condition))
 
     def count_missing(self, experiment: GroupedExperiment) -> int:
-        """Return how many samples of the group the experiment lacks; 0 where it does not apply."""
+        """Return the number of the group's samples that the experiment has not completed; 0 if it does not apply."""
         return 0 if experiment.reason else len(self.samples) - len(self.complete_samples(experiment))
 
 
@@ -146,7 +146,7 @@ def load_records(*results: Path) -> list[LocatedRecord]:
     Raises
     ------
     UserError
-        if one of `results` has no record, or a file is damaged; the message names the file and the line.
+        if one of `results` has no record, or if a file is damaged. The message names the file and the line.
     """
     latest: dict[tuple[str, str], LocatedRecord] = {}
     for result in results:
@@ -165,7 +165,7 @@ def _list_files(result: Path) -> list[Path]:
 
 
 def build_groups(records: Sequence[LocatedRecord]) -> list[ComparisonGroup]:
-    """Return all groups, those with attacks first, and among the others the latest records first."""
+    """Return all groups: those with attacks first, then by task and name of the dataset. Of equal ones the latest comes first."""
     groups = []
     for comparable in reversed(_group_by(records, lambda located: _comparison_key(located.record))):
         seeds = tuple(sorted({located.record["seed"] for located in comparable}))
@@ -217,7 +217,7 @@ def _order_metrics(metrics: set[str]) -> list[str]:
 
 
 def _label_environments(first: Sequence[Record]) -> list[str]:
-    """Return what distinguishes the label of an experiment that was run in several environments; "" for the others."""
+    """Return a suffix for the label of each experiment that was run in several environments; "" for the others."""
     pairs = [canonical_json([record["defense"], record["attack"]]) for record in first]
     environments = [record["environment"] for record in first]
     differing = sorted(name for name in environments[0] if len({canonical_json(one.get(name)) for one in environments}) > 1)

@@ -1,7 +1,7 @@
 """The cost of a service: operations, bytes and seconds of a query, from counts and from rates measured on this machine.
 
-Times are of one core (`time.process_time`, one thread), so that other processes matter little. The number of cores is
-the seconds of a query times the queries per day, divided by the seconds of a day.
+Times are processor times of one thread (`time.process_time`), so that other processes matter little. The number of cores is the
+seconds of a query times the queries per day, divided by the seconds of a day.
 """
 
 from __future__ import annotations
@@ -25,23 +25,23 @@ from bench.types import Features, Subspaces
 
 COLUMNS = ("who", "step", "operations", "bytes", "core seconds", "TB a day", "cores")
 DAY = 86_400  # seconds
-POSITION = 8  # bytes of two float32
+POSITION = 8  # bytes of a position, two float32
 WORD = 4  # bytes of a word's index
-FLOAT = 4
-MIN_SECONDS = 0.2  # minimum time that a rate is measured for
+FLOAT = 4  # bytes of a float32
+MIN_SECONDS = 0.2  # minimum duration of a measurement
 
 
 @dataclass(frozen=True, kw_only=True)
 class Service:
-    """Sizes of a service. The defaults are the paper's, where it states them."""
+    """Sizes of a service. The defaults are the paper's if it states them."""
 
-    keypoints: int = 1000  # of an image; the paper does not say
+    keypoints: int = 1000  # per image; the paper does not state it
     words: int = 256_000  # |K|
     subset_size: int = 2  # m of LDP-Feat
     dim: int = 4  # of a subspace
-    database: int = 256_000  # |W| of lifting, which the database attack searches
-    references: int = 20  # images that a query is matched to
-    length: int = 128  # of a descriptor, D
+    database: int = 256_000  # |W| of affine lifting, which the database attack searches
+    references: int = 20  # images that a query is matched with
+    length: int = 128  # D, of a descriptor
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +50,7 @@ class Rates:
 
     search: float  # operations per second of the search for the nearest word
     subspaces: float  # operations per second of the search for the words nearest to subspaces
-    sets: float  # sets per second
+    sets: float  # released sets drawn per second
     extraction: float  # seconds per photograph of 256 x 256
     lifting: float  # seconds per keypoint
     reconstruction: float  # seconds per photograph of 256 x 256
@@ -58,7 +58,7 @@ class Rates:
 
 @dataclass(frozen=True, kw_only=True)
 class Cost:
-    """One step of a query; None for numbers that do not apply."""
+    """The cost of one step of a query; None for numbers that do not apply."""
 
     party: str
     step: str
@@ -120,7 +120,7 @@ def _time_reconstruction(secret: Features, extractor: Extractor, public: Public)
 
 
 def _time(work: Callable[[], object]) -> float:
-    """Return the shortest processor time of several runs, without the first, which may fill caches."""
+    """Return the shortest processor time of several runs, in seconds. The first run may fill caches and does not count."""
     work()
     times: list[float] = []
     while sum(times) < MIN_SECONDS or len(times) < 3:
@@ -155,7 +155,7 @@ def list_costs(service: Service, rates: Rates) -> Iterator[Cost]:
 
 
 def build_cost_table(service: Service, rates: Rates, queries: int) -> Table:
-    """Return a row for each step: operations, bytes and seconds of a query, then terabytes and cores of so many queries a day."""
+    """Return a table with a row for each step: operations, bytes and seconds per query, then TB and cores of `queries` a day."""
     rows = [
         (
             cost.party,

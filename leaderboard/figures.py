@@ -18,17 +18,17 @@ from leaderboard.tables import add_breaks, build_labels
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-COLUMNS = 6  # panels in a row, the original included
-SIDE = 2.6  # inches a panel
-LINE = 0.2  # inches a line of a title
-WRAP = 34  # characters of a label's line
+COLUMNS = 6  # panels per row, including the original
+SIDE = 2.6  # inches per panel
+LINE = 0.2  # inches per line of a title
+WRAP = 34  # characters per line of a title
 
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """One image with its title, and a line below."""
+    """One image with a title above it and a caption below."""
 
-    pixels: Bytes | None  # (H, W, 3), or None where there is none
+    pixels: Bytes | None  # (H, W, 3), or None if there is no image
     title: str
     caption: str
 
@@ -55,7 +55,7 @@ def draw(panels: Sequence[Panel], heading: str, columns: int = COLUMNS) -> Figur
 
 
 def build_panels(original: Bytes, records: Sequence[Record], images: Sequence[Path]) -> list[Panel]:
-    """Return the panels of one photograph: the original, then one for each record, with its reconstruction."""
+    """Return the panels of one photograph: the original, then the reconstruction of each record."""
     names = build_labels([(record["defense"], record["attack"]) for record in records])
     panels = [Panel(original, "original", "")]
     for record, (defense, attack), image in zip(records, names, images, strict=True):
@@ -76,10 +76,10 @@ def _count_lines(panel: Panel) -> int:
 
 
 def _wrap(title: str) -> str:
-    """Return the title in lines that break between fields."""
+    """Return the title with line breaks between fields."""
     return "\n".join(part for line in add_breaks(title).split("\n") for part in textwrap.wrap(line, WRAP, break_on_hyphens=False))
 
 
 def escape_text(text: str) -> str:
-    """Return text that matplotlib draws unchanged: without mathematics between dollar signs and without lone surrogates."""
+    """Return text that matplotlib draws literally: dollar signs start no mathematics, and lone surrogates are replaced."""
     return text.replace("$", r"\$").encode(errors="replace").decode()

@@ -20,22 +20,22 @@ from leaderboard.tables import COMPOSITION_REMARK, SEED_REMARK, format_chance, f
 Value = Interval | float | int | str | None
 
 INTERVAL_REMARK = (
-    f"In brackets: {LEVEL:.0%} percentile bootstrap over the samples; Wilson's interval where each sample succeeds or fails. "
-    "A single sample has no interval, and a median has none."
+    f"In brackets: the {LEVEL:.0%} percentile bootstrap over the samples, or Wilson's interval if each sample succeeds or fails. "
+    "A single sample and a median have no interval."
 )
-NOT_APPLICABLE_REMARK = f"{NOT_APPLICABLE} without a note: that metric does not apply to what the attack recovers."
+NOT_APPLICABLE_REMARK = f"{NOT_APPLICABLE} without a note: the metric does not apply to the result of the attack."
 RANK_REMARK = (
-    "Rank: by the strongest attack, the one with the greatest mean SSIM; the best of the ranked ones in bold. A defense is "
-    "unranked, and comes last, if no attacker was adapted to it, or if an attack has not completed all samples."
+    "Rank: by the strongest attack, the one with the greatest mean SSIM. The best values of ranked defenses are bold. A defense "
+    "is unranked and comes last if no attacker was adapted to it, or if an attack has not completed all samples."
 )
 
 
 @dataclass(frozen=True, kw_only=True)
 class GroupColumn(Column):
-    """A column with its name for programs."""
+    """A column with a name that programs use."""
 
     name: str
-    better: int = 0  # 1: the greatest value is the best, -1: the least
+    better: int = 0  # 1: the greatest value is the best; -1: the least; 0: neither
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -43,8 +43,8 @@ class GroupRow(Row):
     """The row of one experiment."""
 
     experiment: GroupedExperiment
-    strongest: bool  # of the attacks on its defense
-    competes: bool  # for the best value of a column
+    strongest: bool  # whether it is the strongest attack on its defense
+    competes: bool  # whether its values can be the best of a column
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -56,7 +56,7 @@ class GroupTable(Table):
 
 
 def build_pairs_table(group: ComparisonGroup) -> GroupTable:
-    """Return a table of every experiment; with attacks by rank of the defense, the strongest attack first."""
+    """Return a table with a row for each experiment. With attacks, rows are in the order of rank, the strongest attack first."""
     columns = _build_columns(group)
     explanations = [f"{measure.label}: {measure.explanation}" for measure in group.measures if measure.explanation]
     rank = [RANK_REMARK] if group.has_attacks else []
@@ -70,14 +70,14 @@ def build_pairs_table(group: ComparisonGroup) -> GroupTable:
 
 
 def build_ranking_table(group: ComparisonGroup) -> GroupTable:
-    """Return a table of each defense, with the strongest attack on it."""
+    """Return a table with a row for each defense, with the strongest attack on it."""
     table = build_pairs_table(group)
     rows = tuple(row for row in table.rows if row.strongest)
     return dataclasses.replace(table, heading=f"Ranking. {table.heading}", rows=rows)
 
 
 def comparable_number(value: Value) -> float | None:
-    """Return the number that a value is compared by; None for text."""
+    """Return a value as a number for comparisons; None for text."""
     if isinstance(value, Interval):
         return value.mean
     return float(value) if isinstance(value, int | float) else None
@@ -119,7 +119,7 @@ def _build_columns(group: ComparisonGroup) -> tuple[GroupColumn, ...]:
 
 
 def _list_measured(group: ComparisonGroup) -> list[tuple[Measure, str | None]]:
-    """Return the measures that have a column: judged ones for each condition, and counts over all conditions."""
+    """Return the measures that have a column: those with a better direction per condition, the others over all conditions."""
     judged = [(measure, condition) for condition in group.conditions for measure in group.measures if measure.better]
     return [*judged, *((measure, None) for measure in group.measures if not measure.better)]
 
@@ -129,7 +129,7 @@ def _join(name: str, separator: str, condition: str | None) -> str:
 
 
 def _order_experiments(group: ComparisonGroup) -> Iterable[tuple[GroupedExperiment, Standing | None]]:
-    """Yield the experiments by rank, the strongest attack of each defense first; without attacks, the most useful first."""
+    """Yield the experiments by rank, the strongest attack on each defense first. Without attacks, the most useful comes first."""
     if group.has_attacks:
         for standing in rank_defenses(group):
             others = [experiment for experiment in standing.experiments if experiment is not standing.strongest]
@@ -194,7 +194,7 @@ def _mark_best(columns: Sequence[GroupColumn], rows: Sequence[GroupRow]) -> tupl
 
 
 def _format_value(name: str, value: Value, count: int | None) -> str:
-    """Return a value for people, with its interval and with its number of samples where that is not the row's."""
+    """Return a value as text, with its interval, and with its number of samples if that differs from the row's."""
     if value is None:
         return NOT_APPLICABLE
     if name == "log10_true" and isinstance(value, float):
@@ -206,7 +206,7 @@ def _format_value(name: str, value: Value, count: int | None) -> str:
 
 
 def _list_notes(group: ComparisonGroup, experiment: GroupedExperiment, standing: Standing | None) -> Iterator[str]:
-    """Yield why a row has no rank or no values, what failed, and what all its records note."""
+    """Yield the reasons for a missing rank or missing values, the failures, and the notes that all records have."""
     unranked_reason = standing.unranked_reason if standing else None
     if unranked_reason:
         yield f"unranked: {unranked_reason}"
@@ -215,11 +215,11 @@ def _list_notes(group: ComparisonGroup, experiment: GroupedExperiment, standing:
             yield experiment.reason
         return
     if missing := group.count_missing(experiment):
-        yield f"{missing} of {len(group.samples)} not done"
+        yield f"{missing} of {len(group.samples)} samples missing"
     if failed := experiment.failed:
         yield f"{len(failed)} failed: {failed[0]['sample']}: {failed[0]['reason']}"
     completed = experiment.completed
     first_notes = completed[0].get("notes", ()) if completed else ()
     yield from (note for note in first_notes if all(note in record["notes"] for record in completed))
     if uncovered := [part for part in experiment.metadata["privacy"].get("uncovered", ()) if part not in UNCOVERED]:
-        yield f"not covered either: {', '.join(uncovered)}"
+        yield f"also not covered: {', '.join(uncovered)}"

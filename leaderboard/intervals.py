@@ -13,12 +13,12 @@ from scipy.stats import binomtest
 
 LEVEL = 0.95
 RESAMPLES = 10_000
-SEED = 0  # equal sizes are resampled equally, so that intervals of one table can be compared
+SEED = 0  # samples of equal size are resampled alike, so that intervals of one table can be compared
 
 
 @dataclass(frozen=True)
 class Interval:
-    """A mean with its confidence interval, 95% by default, for other photographs of the same kind."""
+    """A mean with its confidence interval, 95% by default. The population is photographs of the same kind."""
 
     mean: float
     low: float
@@ -27,9 +27,9 @@ class Interval:
 
 
 def interval(values: ArrayLike, level: float = LEVEL) -> Interval:
-    """Return the mean of (n,) values, one per photograph, n ≥ 1, with its bootstrap interval; infinite if n = 1.
+    """Return the mean of (n,) values, one per photograph, n ≥ 1, with its bootstrap interval.
 
-    For a paired comparison, pass the differences.
+    The interval is infinite if n = 1. For a paired comparison, pass the differences.
     """
     sample = np.asarray(values, dtype=np.float64)
     if len(sample) == 1:
@@ -41,7 +41,7 @@ def interval(values: ArrayLike, level: float = LEVEL) -> Interval:
 
 
 def combine_independent(samples: Sequence[ArrayLike], weights: Sequence[float]) -> Interval:
-    """Return Σ weight · mean of independent samples, each resampled separately; `count` is that of the smallest."""
+    """Return Σ weight · mean of independent samples, each resampled separately. `count` is the size of the smallest sample."""
     total, resampled = 0.0, np.zeros(RESAMPLES)
     for rng, values, weight in zip(np.random.default_rng(SEED).spawn(len(samples)), samples, weights, strict=True):
         sample = np.asarray(values, dtype=np.float64)
@@ -53,12 +53,12 @@ def combine_independent(samples: Sequence[ArrayLike], weights: Sequence[float]) 
 
 
 def proportion(hits: ArrayLike, times: float = 1.0) -> Interval:
-    """Return the fraction of hits among (n,) trials, each 1 or 0, with Wilson's interval (1927); all multiplied by `times`."""
+    """Return the fraction of hits among (n,) trials, each 1 or 0, with Wilson's interval (1927), all multiplied by `times`."""
     sample = np.asarray(hits, dtype=np.float64)
     wilson = binomtest(int(sample.sum()), len(sample)).proportion_ci(LEVEL, method="wilson")
     return Interval(float(sample.mean()) * times, float(wilson.low) * times, float(wilson.high) * times, len(sample))
 
 
 def rank_correlation(one: Sequence[float], other: Sequence[float]) -> float:
-    """Return Spearman's ρ of two lists of equal length; ties share their mean rank. NaN where it is undefined."""
+    """Return Spearman's ρ of two lists of equal length; NaN if it is undefined. Ties have their mean rank."""
     return float(pd.DataFrame({"one": one, "other": other}).corr(method="spearman").to_numpy()[0, 1])

@@ -1,4 +1,4 @@
-"""Localization results for other programs: poses for Aachen's evaluation server, and retrieved images as hloc's pairs."""
+"""Writes localization results for other programs: poses for Aachen's evaluation server, and retrieved images as hloc's pairs."""
 
 from __future__ import annotations
 
@@ -18,15 +18,16 @@ ESTIMATES = "estimates"
 
 
 def write(records: Iterable[Record], out: Path) -> Iterator[str]:
-    """Write the files into `out`, from records alone, and yield a line for each file.
+    """Write the files into `out`, from records alone, and yield a line of text for each file.
 
-    For each defense on Aachen `Aachen_eval_[method].txt`, without the queries that failed or were not localized, which are
-    counted; and `pairs.txt`, or `pairs-[method].txt` for each defense where they differ.
+    Each defense on Aachen has a file `Aachen_eval_[method].txt`. It excludes the queries that failed or were not localized, and
+    the line states their number. `pairs.txt` has the retrieved images. If they differ between defenses, each defense has a file
+    `pairs-[method].txt`.
 
     Raises
     ------
     UserError
-        if two queries of Aachen have one name, folders aside.
+        if two queries of Aachen have the same name apart from their folders.
     OSError
         if a file cannot be written.
     """
@@ -48,7 +49,7 @@ def write(records: Iterable[Record], out: Path) -> Iterator[str]:
         except UserError as error:  # a name with a space, which hloc's format does not allow
             yield f"{path}: not written: {error}"
             continue
-        yield f"{path}: what was retrieved for {len(by_query)} queries"
+        yield f"{path}: the images retrieved for {len(by_query)} queries"
     for method, experiment in zip(methods, experiments.values(), strict=True):
         if experiment[0]["dataset"]["name"] == "aachen":
             poses = {record["sample"]: _read_pose(record) for record in experiment}

@@ -1,4 +1,4 @@
-"""Measures: the labels of the numbers in records, which direction is better for the defender, and how they are averaged."""
+"""Measures: label, better direction for the defender, and kind of average of each number in records."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from bench.registry import discovery
 from leaderboard.intervals import Interval, interval, proportion
 from leaderboard.tables import MEDIAN_METRICS, PAPER_METRICS
 
-PRIVACY = "ssim"  # ranks attacks by how much of the photograph they reconstruct
-# The first of these that was measured is the utility: the recall of localization, or else the accuracy of matching.
+PRIVACY = "ssim"  # the measure that ranks attacks
+# The utility is the first of these with values: the recall of localization, otherwise the accuracy of matching.
 UTILITY = ("recall_0.25m_2deg", "accuracy_3px")
 
-PARTS = ("foreground", "background")  # of an image, for which some metrics are also recorded
+PARTS = ("foreground", "background")  # parts of an image for which records have additional values of some metrics
 
 
 @dataclass(frozen=True)
@@ -31,13 +31,13 @@ class Measure:
     name: str
     label: str
     better: int  # for the defender: 1 if larger is better, -1 if smaller, 0 if neither
-    # A fraction counts the samples that succeed. A median counts a sample without a value as the worst.
+    # A fraction is that of the samples that succeed. For a median, a sample without a value counts as the worst.
     kind: Literal["mean", "fraction", "median"] = "mean"
     explanation: str = ""
 
 
 def list_measures(names: Iterable[str]) -> list[Measure]:
-    """Return the measures of these metrics. One that is not installed has a name alone."""
+    """Return the measures of these metrics. The measure of a metric that is not installed has a name alone."""
     known = {measure.name: measure for measure in (*_TASK_MEASURES, *_list_plugin_measures())}
     for measure, part in itertools.product(list(known.values()), PARTS):
         name = f"{measure.name}_{part}"
@@ -46,14 +46,14 @@ def list_measures(names: Iterable[str]) -> list[Measure]:
 
 
 def summarize(measure: Measure, values: Sequence[float | None]) -> Interval | None:
-    """Return the average of a measure from one value per sample, None where a sample has none; None if no sample has one.
+    """Return the average of a measure over samples; None if no sample has a value.
 
-    A median has no interval: its ends are infinite.
+    `values` has one value per sample, None for a sample without one. A median has no interval, so its ends are infinite.
     """
     return _summarize(measure, tuple(values))
 
 
-@functools.lru_cache(maxsize=1 << 14)  # tables, ranks and plots need the same ones
+@functools.lru_cache(maxsize=1 << 14)  # tables, ranks and plots need the same averages
 def _summarize(measure: Measure, values: tuple[float | None, ...]) -> Interval | None:
     known = [value for value in values if value is not None]
     if not known:
@@ -72,8 +72,8 @@ _TASK_MEASURES = (
         for name, unit in zip(MEDIAN_METRICS, ("scene units", "degrees"), strict=True)
     ),
     Measure("precision", "precision", 1, "mean", "fraction of matches that are right"),
-    Measure("recall", "recall", 1, "mean", "fraction of right matches that are found"),
-    Measure("registered", "registered images", 1, "mean", "images of the scene that structure from motion registered"),
+    Measure("recall", "recall", 1, "mean", "fraction of the right matches that are found"),
+    Measure("registered", "registered images", 1, "mean", "images of the scene that structure from motion registers"),
     Measure("right_poses", "right poses", 1, "mean", "registered images within 5% of the scene's extent and 5° of the truth"),
     Measure("points", "sparse points", 1, "mean", "points of the map"),
     Measure("track_length", "track length", 1, "mean", "images that see a point of the map"),

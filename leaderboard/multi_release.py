@@ -1,4 +1,4 @@
-"""The curve of repeated releases: how often T word sets reveal the true word, and the upper bound at T ε."""
+"""The curve of repeated releases: the probability that T word sets reveal the true word, and its upper bound at T ε."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ if TYPE_CHECKING:
 def build_rows(epsilon: float, domain: int, size: int, releases: int) -> list[dict[str, Any]]:
     """Return a row for each T = 1, ..., `releases` of the ω-subset mechanism on |K| = `domain` words with m = `size`.
 
-    `success` is the probability that the word in most sets is the true one, `bound` is the greatest probability of any guess at
-    T ε, and `epsilon_total` is T ε.
+    `success` is the probability that the word in most sets is the true one. `bound` is the greatest success probability of any
+    guess at T ε, and `epsilon_total` is T ε.
     """
     chances = compute_success_chances(epsilon, domain, size, releases)
     return [

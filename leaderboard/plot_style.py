@@ -1,6 +1,6 @@
-"""Plot styles: families of defenses differ in the shapes of points and the styles of lines, and not in colour alone.
+"""Plot styles of families of defenses, which differ in the shape of points, the style of lines and the colour.
 
-The colours are Okabe and Ito's, which people with any kind of colour blindness can distinguish.
+The colours are those of Okabe and Ito, which people with any kind of colour blindness can distinguish.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class PlotStyle:
-    """The style of one family: matplotlib's names, and the shape as an SVG path around the origin, some 10 pixels wide."""
+    """The style of one family: matplotlib's names, and the shape as an SVG path around the origin, about 10 pixels wide."""
 
     marker: str
     path: str
@@ -37,16 +37,16 @@ STYLES = (
 
 
 def choose_styles(families: Iterable[str]) -> dict[str, PlotStyle]:
-    """Return a style for each family, in their order. More families than styles reuse some."""
+    """Return a style for each family, in their order. Styles repeat if there are more families."""
     return {family: STYLES[index % len(STYLES)] for index, family in enumerate(dict.fromkeys(families))}
 
 
 def position_labels(
     points: Sequence[tuple[float, float]], sizes: Sequence[tuple[float, float]], size: tuple[float, float], gap: float = 9.0
 ) -> list[tuple[float, float] | None]:
-    """Return a position for each label that covers no point, no other label and no border; None if there is no room.
+    """Return a position for each label, at which it covers no point, no other label and no border; None if there is no room.
 
-    A label is nearer to its own point than to any other.
+    A label is nearer to its own point than to any other point.
 
     Parameters
     ----------

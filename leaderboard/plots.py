@@ -1,4 +1,4 @@
-"""Plots of a comparison group. Points and line styles differ, not colour alone: for print in grey and for colour blindness."""
+"""Plots of a comparison group. The shape of points and lines differs as well, for grey print and for colour blindness."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 TRADEOFF = "tradeoff"  # prefix of the plots that the page draws itself
-BRIEF = 48  # letters of a label
-ROW = 0.3  # inches a defense
-LETTER = 3.9, 9.0  # points that a letter of a label is wide and high
+BRIEF = 48  # maximum number of letters of a label
+ROW = 0.3  # inches per defense
+LETTER = 3.9, 9.0  # width and height of a letter of a label, in points
 
 
 def draw_plots(group: ComparisonGroup, tradeoffs: Sequence[Tradeoff]) -> Iterator[tuple[str, Figure]]:
@@ -40,14 +40,14 @@ def draw_plots(group: ComparisonGroup, tradeoffs: Sequence[Tradeoff]) -> Iterato
 
 
 def draw_tradeoff(tradeoff: Tradeoff) -> Figure:
-    """Draw each defense and setting: utility to the right, what the strongest attack recovers upwards, and the Pareto front."""
+    """Draw the utility of each defense and setting (x), the score of the strongest attack on it (y), and the Pareto front."""
     figure, axes = _create_axes(7.2, 4.6, tradeoff.caption)
     for family, style in choose_family_styles(tradeoff).items():
         members = [point for point in tradeoff.points if point.standing.configuration["name"] == family]
         for ranked, label in ((True, family), (False, f"{family}, unranked")):
             at = [(point.utility, point.privacy) for point in members if (point.standing.rank is not None) == ranked]
             _draw_points(axes, at, style, filled=ranked, label=label)
-    # Between two settings of the front, what the further one costs is the least that buys more than the nearer one gives.
+    # For a utility between two settings of the front, the least privacy loss is that of the more useful setting: a step.
     x, y = [point.utility.mean for point in tradeoff.front], [point.privacy.mean for point in tradeoff.front]
     axes.plot(x, y, color="0.35", lw=1, ls=(0, (4, 2)), drawstyle="steps-pre", zorder=1, label="Pareto front")
     axes.set_xlabel(f"{tradeoff.utility.label} →", fontsize=9)
@@ -60,7 +60,7 @@ def draw_tradeoff(tradeoff: Tradeoff) -> Figure:
 
 
 def draw_attacks(group: ComparisonGroup, ranked: Sequence[Standing]) -> Figure:
-    """Draw what each attack recovers of each defense, one line per defense, with intervals."""
+    """Draw the score of each attack on each defense, one line per defense, with intervals."""
     (privacy,) = list_measures([PRIVACY])
     experiments = [experiment for standing in ranked for experiment in standing.experiments]
     names = list(dict.fromkeys(experiment.attack for experiment in experiments if group.average(experiment, privacy)))
@@ -88,7 +88,7 @@ def draw_attacks(group: ComparisonGroup, ranked: Sequence[Standing]) -> Figure:
 
 
 def draw_epsilon(group: ComparisonGroup, curves: dict[str, list[Standing]]) -> Figure:
-    """Draw what the strongest attack recovers, over the ε of a descriptor."""
+    """Draw the score of the strongest attack over the ε of a descriptor."""
     (privacy,) = list_measures([PRIVACY])
     figure, axes = _create_axes(5.6, 3.6, ", ".join([group.title, *group.facts[:3]]))
     for (label, curve), style in zip(curves.items(), choose_styles(curves).values(), strict=True):
@@ -119,7 +119,7 @@ def choose_family_styles(tradeoff: Tradeoff) -> dict[str, PlotStyle]:
 
 
 def label_points(tradeoff: Tradeoff) -> list[str]:
-    """Return the label of each point, `ldp ε 10`: the defense's name, and those of its fields that differ among the points."""
+    """Return the label of each point, such as `ldp ε 10`: the defense's name, and its fields that differ among the points."""
     configurations = [point.standing.configuration for point in tradeoff.points]
     texts = []
     for configuration in configurations:
@@ -132,7 +132,7 @@ def label_points(tradeoff: Tradeoff) -> list[str]:
 
 
 def _collect_curves(ranked: Sequence[Standing]) -> dict[str, list[Standing]]:
-    """Return the settings that differ in ε alone, at least two of them, by their label without ε and in the order of ε."""
+    """Return groups of at least two settings that differ in ε alone, by their label without ε. Each is in the order of ε."""
     curves: dict[str, list[Standing]] = {}
     for standing in ranked:
         if standing.rank is not None and math.isfinite(_get_epsilon(standing)):
@@ -205,5 +205,5 @@ def _label_standing(standing: Standing) -> str:
 
 
 def _shorten(text: str) -> str:
-    """Return text that leaves room for the plot."""
+    """Return the text, shortened to BRIEF letters."""
     return escape_text(text if len(text) <= BRIEF else text[: BRIEF - 1] + "…")

@@ -1,4 +1,4 @@
-"""Ranking of defenses, each by the strongest attack on it: the one that reconstructs most of the photograph."""
+"""Ranking of defenses, each by the strongest attack on it: the one with the greatest mean SSIM."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from leaderboard.comparison import ComparisonGroup, GroupedExperiment
 from leaderboard.intervals import Interval
 from leaderboard.measures import PRIVACY, Measure, list_measures
 
-ADAPTED = "dia"  # the attack whose network is trained for the defense itself; any other makes a defense look safe
+ADAPTED = "dia"  # the attack whose network is trained for the defense; without it, a defense may look safe
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -21,10 +21,10 @@ class Standing:
 
     defense: str
     experiments: tuple[GroupedExperiment, ...]
-    strongest: GroupedExperiment | None  # None where no attack made an image
+    strongest: GroupedExperiment | None  # None if no attack reconstructed an image
     score: Interval | None  # of the strongest attack
-    unranked_reason: str | None  # why it has no rank
-    rank: int | None = None  # from 1, the most private; equal scores share one
+    unranked_reason: str | None  # None for a ranked defense
+    rank: int | None = None  # 1 is the most private; equal scores have equal ranks
 
     @property
     def configuration(self) -> dict[str, Any]:
@@ -58,16 +58,16 @@ def _judge_defense(group: ComparisonGroup, experiments: Sequence[GroupedExperime
 
 
 def _explain_unranked(group: ComparisonGroup, experiments: Sequence[GroupedExperiment], score: Interval | None) -> str | None:
-    """Return why a defense has no rank, or None if it has one."""
+    """Return the reason why a defense has no rank, or None if it has one."""
     adapted = [one for one in experiments if (one.metadata["attack"] or {}).get("name") == ADAPTED]
     if not adapted:
         return f"no adapted attacker was run ({ADAPTED})"
     if all(one.reason for one in adapted):
         return adapted[0].reason
-    for one in experiments:  # the completed samples alone might be the easy ones
+    for one in experiments:  # the completed samples may be the easy ones
         if group.count_missing(one):
-            return f"{one.attack} has done {len(group.complete_samples(one))} of {len(group.samples)}"
-    return None if score else "no attack made an image"
+            return f"{one.attack} has completed {len(group.complete_samples(one))} of {len(group.samples)} samples"
+    return None if score else "no attack reconstructed an image"
 
 
 def _mean_score(standing: Standing) -> float:

@@ -1,4 +1,4 @@
-"""The command that repeats an experiment, from its records."""
+"""Builds the command that repeats an experiment, from its records."""
 
 from __future__ import annotations
 
@@ -9,22 +9,23 @@ from dataclasses import dataclass
 from typing import Any
 
 from bench.api import Defense, Plugin
-from bench.codebook.public import ASSETS, SHIPPED
+from bench.codebook.public import SHIPPED
 from bench.core.errors import UserError
 from bench.registry import discovery, fields
 from bench.registry.discovery import Kind
 from bench.runner.records import Record
 from bench.task_api import Task
+from leaderboard import provenance
 from leaderboard.comparison import GroupedExperiment
 
 BUILTIN = "builtin"  # the photographs that need no --images
 Lookup = Callable[[Kind, str], type[Plugin] | None]
-DEFAULT = {"--task": "reconstruction", "--extractor": "sift"}  # of the command line
+DEFAULT = {"--task": "reconstruction", "--extractor": "sift"}  # options that may be omitted
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """Lines for a shell, and the files that they need."""
+    """Shell commands, and descriptions of the files that they need."""
 
     command: str
     needs: tuple[str, ...]
@@ -40,9 +41,10 @@ def find_plugin(kind: Kind, name: str) -> type[Plugin] | None:
 
 
 def build_recipe(experiment: GroupedExperiment, lookup: Lookup = find_plugin) -> Recipe:
-    """Return the `bench run` command of an experiment. The user's own files appear as FILE, and `needs` states their digests.
+    """Return the `bench run` commands of an experiment, one per seed.
 
-    A plugin that is not installed has all its recorded fields. Many experiments can share a cached `lookup`.
+    The user's own files appear as FILE, and `needs` states their digests. The specification of a plugin that is not installed has
+    all recorded fields. Many experiments can share a cached `lookup`.
     """
     metadata, spec = experiment.metadata, functools.partial(_write_spec, lookup)
     needs: dict[str, None] = {}
@@ -88,16 +90,16 @@ def _list_metrics(lookup: Lookup, settings: Mapping[str, Mapping[str, Any]], nee
 def _write_spec(
     lookup: Lookup, kind: Kind, configuration: Mapping[str, Any], needs: dict[str, None], scene_field: str | None = None
 ) -> str:
-    """Return a plugin's specification without default fields. The command itself fills `scene_field`."""
+    """Return a plugin's specification without fields at their defaults. `bench run` itself fills `scene_field`."""
     plugin = lookup(kind, configuration["name"])
     defaults = fields.list_defaults(plugin) if plugin else {}
     given = []
     for field, value in configuration.items():
         if field == "name" or isinstance(value, dict) or (plugin and field not in fields.resolve_types(plugin)):
-            continue  # settings of nested plugins are no fields
+            continue  # settings of nested plugins are not fields
         text = _format_value(value)
         if field == scene_field and text == "FILE":
-            needs[f"{field} of {configuration['name']} is made from the references of the scene, or was a file: {value}"] = None
+            needs[f"{field} of {configuration['name']} is made from the references of the scene, or was the file {value}"] = None
         elif field not in defaults or text != _format_value(defaults[field]):
             given.append(f"{field}={text}")
             if text == "FILE":
@@ -117,15 +119,6 @@ def _format_value(value: Any) -> str:
 
 @functools.cache
 def _index_shipped() -> dict[str, str]:
-    """Return the digest of each installed file, with the name that a field uses for it."""
+    """Return a mapping from the digest of each installed file to the field value that selects it."""
     names = {file: name for name, file in SHIPPED.items()}
-    return {digest: names.get(file, "shipped") for file, digest in _read_digests()}
-
-
-def _read_digests() -> Iterator[tuple[str, str]]:
-    """Yield name and digest of each shipped file, from its header."""
-    from safetensors import safe_open
-
-    for path in sorted(ASSETS.glob("*.safetensors")):
-        with safe_open(path, framework="numpy") as opened:
-            yield path.name, (opened.metadata() or {}).get("digest", "")
+    return {digest: names.get(file, "shipped") for file, digest in provenance.read_digests().items()}

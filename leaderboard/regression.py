@@ -1,15 +1,16 @@
 """Regression check: results against a baseline, one experiment at a time.
 
-Experiments match if their configurations and inputs are equal except for the seed. Samples such as photographs are paired, and a
-sample counts with its mean over the seeds. A mean difference over the samples is significant if it exceeds the tolerance
+Experiments match if their configurations and inputs are equal except for the seed. Samples such as photographs are paired,
+and each sample counts with its mean over the seeds. A mean difference over the samples is significant if it exceeds the
+tolerance
 
     max(minimum, t · s · sqrt(Σ_u (1/n_u + 1/n'_u)) / U)
 
-where s² is the variance from seed to seed within samples, pooled over the samples of both sides, n_u and n'_u are the seeds of
-sample u on either side, and U counts the samples. t is the quantile of Student's distribution, for s's degrees of freedom, that
-chance exceeds once in a thousand comparisons. With one seed on each side there is no such variance; then the tolerance is the
-bootstrap over the samples of the paired differences, at the same level. The minimum is what a number may move between machines
-and versions of libraries.
+where s² is the variance between seeds within samples, pooled over the samples of both sides. n_u and n'_u are the numbers of
+seeds of sample u on either side, and U is the number of samples. t is a quantile of Student's distribution with the degrees
+of freedom of s: chance exceeds it in one of a thousand comparisons. With one seed on each side there is no such variance. The
+tolerance is then the bootstrap interval of the paired differences over samples, at the same level. The minimum covers
+differences between machines and between versions of libraries.
 """
 
 from __future__ import annotations
@@ -55,10 +56,10 @@ class RegressionResult:
 
 
 def compare(baseline: Iterable[Record], results: Iterable[Record]) -> list[RegressionResult]:
-    """Compare every judged metric of every experiment that either side has. Returns the most severe results first.
+    """Compare each metric with a better direction, of all experiments of both sides. Returns the most severe results first.
 
-    If an attacker recovers less of a defense whose source is unchanged, the verdict is `weaker`, for the attack: no defense gets
-    better by that. Where records lack the source, it counts as unchanged.
+    The verdict is `weaker` if an attack recovers less from a defense with unchanged source: then the attack got worse, and
+    not the defense better. A source that the records lack counts as unchanged.
     """
     before, after = _group_experiments(baseline), _group_experiments(results)
     experiments = {**after, **before}
@@ -77,9 +78,9 @@ def compare(baseline: Iterable[Record], results: Iterable[Record]) -> list[Regre
 
 
 def compute_tolerance(before: SampleValues, after: SampleValues, minimum: float) -> float:
-    """Return how far the means of two sides may differ, by the rule at the top of this file.
+    """Return the tolerance of the difference between two means, by the rule at the top of this file.
 
-    Both sides have the same samples, at least one. One sample under one seed has no variance; there the minimum alone decides.
+    Both sides have the same samples, at least one. For one sample with one seed, which has no variance, it is the minimum.
     """
     sides = [[np.asarray(side[sample], np.float64) for sample in before] for side in (before, after)]
     values = [sample for side in sides for sample in side]
@@ -96,7 +97,7 @@ def compute_tolerance(before: SampleValues, after: SampleValues, minimum: float)
 
 
 def _group_experiments(records: Iterable[Record]) -> dict[str, list[Record]]:
-    """Return the latest record of each sample and seed, by what the records of an experiment share except for the seed."""
+    """Return the latest record of each sample and seed, grouped by experiment regardless of the seed."""
     latest = {(record["experiment_id"], record["sample"]): record for record in records}
     experiments: dict[str, list[Record]] = {}
     for record in latest.values():
@@ -105,7 +106,7 @@ def _group_experiments(records: Iterable[Record]) -> dict[str, list[Record]]:
 
 
 def _experiment_key(record: Record) -> str:
-    """Return what `experiment_id` hashes, without the seed and the metrics' settings: a new metric does not change the key."""
+    """Return the content that `experiment_id` hashes, without seed and metric settings: a new metric does not change it."""
     dataset = {name: value for name, value in record["dataset"].items() if name not in ("name", "spec")}
     parts = ("schema", "task", "task_settings", "defense", "attack")
     return canonical_json([dataset, *(record.get(part) for part in parts)])
@@ -132,7 +133,7 @@ def _compare_experiment(
         if metric.better == 0 or not samples:
             continue
         if _get_settings(before, metric.name) != _get_settings(after, metric.name):
-            yield build(verdict="missing", metric=metric.name, note="it is measured with other settings")
+            yield build(verdict="missing", metric=metric.name, note="measured with other settings")
             continue
         old_values, new_values = ({sample: side[sample] for sample in samples} for side in (old_values, new_values))
         first, second = _mean(old_values), _mean(new_values)
@@ -186,7 +187,7 @@ def _get_settings(records: Sequence[Record], metric: str) -> Any:
 
 
 def _judge(gain: float, tolerance: float, has_attack: bool, changed: Sequence[str]) -> Verdict:
-    """Return the verdict on a change; a positive `gain` favours the defender."""
+    """Return the verdict on a change. A positive `gain` favours the defender."""
     if abs(gain) <= tolerance:
         return "same"
     if gain < 0:
@@ -196,8 +197,8 @@ def _judge(gain: float, tolerance: float, has_attack: bool, changed: Sequence[st
 
 def _explain(verdict: Verdict, has_attack: bool, changed: Sequence[str]) -> str:
     if verdict == "weaker":
-        return "the attacker recovers less of a defense whose source is unchanged"
+        return "the attacker recovers less from a defense with unchanged source"
     if verdict == "worse" and has_attack:
         parts = " and ".join(changed)
         return f"the attacker recovers more; the source of the {parts} changed" if parts else "the attacker recovers more"
-    return "a server can do less" if verdict == "worse" else ""
+    return "the server can do less" if verdict == "worse" else ""

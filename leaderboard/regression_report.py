@@ -1,4 +1,4 @@
-"""The results of a regression check as a table, and as annotations of GitHub's."""
+"""Formats the results of a regression check as a table and as annotations of GitHub."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ TEXT = ("verdict", "defense", "attack", "metric", "note")  # the other columns a
 
 
 def summarize(results: Sequence[RegressionResult]) -> str:
-    """Return one line: how many results there are of each verdict."""
+    """Return one line with the number of results of each verdict."""
     counts = Counter(result.verdict for result in results)
     return ", ".join(f"{counts[verdict]} {verdict}" for verdict in LEVEL if counts[verdict]) or "nothing to compare"
 
@@ -33,7 +33,7 @@ def build_results_table(results: Sequence[RegressionResult]) -> Table:
 
 
 def to_github(result: RegressionResult) -> str:
-    """Return a workflow command (GitHub's documentation, "Workflow commands"), which shows as an annotation."""
+    """Return a workflow command, which GitHub shows as an annotation (GitHub's documentation, "Workflow commands")."""
     title = f"{result.verdict}: {result.defense} against {result.attack}"
     before, after, tolerance = map(format_number, (result.before, result.after, result.tolerance))
     metric = f"{result.metric} was {before}, is {after}, may move by {tolerance}" if result.metric else ""
@@ -47,10 +47,10 @@ def _format_row(result: RegressionResult) -> tuple[str, ...]:
 
 
 def _escape_data(text: str) -> str:
-    """As actions/toolkit's `escapeData`."""
+    """Return the text escaped as by `escapeData` of actions/toolkit."""
     return text.replace("%", "%25").replace("\r", "%0D").replace("\n", "%0A")
 
 
 def _escape_property(text: str) -> str:
-    """As actions/toolkit's `escapeProperty`."""
+    """Return the text escaped as by `escapeProperty` of actions/toolkit."""
     return _escape_data(text).replace(":", "%3A").replace(",", "%2C")

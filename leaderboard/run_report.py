@@ -12,27 +12,31 @@ from bench.core.table import to_csv, to_markdown
 from bench.runner.directory import photograph_path, reconstruction_path
 from bench.runner.records import Record
 from leaderboard import figures, tables
+from leaderboard.provenance import CHUNK, format_provenance
 
 
-def write(records: Sequence[Record], out: Path) -> None:
+def write(records: Sequence[Record], out: Path, command: str) -> None:
     """Write the report of `records` into the folder `out`, which holds their photographs and reconstructions.
+
+    The figures hold `command`, the command line that ran them, in their provenance.
 
     Raises
     ------
     OSError
-        if it cannot be written.
+        if a file cannot be written.
     """
     report = tables.build_tables(records)
     markdown = "\n".join(to_markdown(table, plain=True) for table in report)
     (out / "report.md").write_text(markdown, encoding="utf-8", errors="replace")
     (out / "report.csv").write_text(to_csv(*report), encoding="utf-8", errors="replace")
+    provenance = format_provenance(command, records)
     for sample in dict.fromkeys(record["sample"] for record in records):
         sample_records = [record for record in records if record["sample"] == sample]
         if any(reconstruction_path(out, record).is_file() for record in sample_records):
-            _write_figure(sample, sample_records, out)
+            _write_figure(sample, sample_records, out, provenance)
 
 
-def _write_figure(sample: str, records: Sequence[Record], out: Path) -> None:
+def _write_figure(sample: str, records: Sequence[Record], out: Path, provenance: str) -> None:
     photograph, figure = photograph_path(out, records[0]), out / "figures" / f"{sample}.png"
     if not photograph.is_file():
         return  # it was removed since
@@ -40,4 +44,5 @@ def _write_figure(sample: str, records: Sequence[Record], out: Path) -> None:
     original = np.asarray(Image.open(photograph))
     panels = figures.build_panels(original, records, [reconstruction_path(out, record) for record in records])
     # Without the software's version, the same run gives the same file.
-    figures.draw(panels, f"{sample}. {tables.SEED_REMARK}").savefig(figure, metadata={"Software": None})
+    drawing = figures.draw(panels, f"{sample}. {tables.SEED_REMARK}")
+    drawing.savefig(figure, metadata={"Software": None, CHUNK: provenance})

@@ -1,8 +1,8 @@
 """Speed: ratios of times within one run of pytest-benchmark, compared with ratios of a reference run.
 
-Times of two machines cannot be compared. A group of benchmarks holds floors, such as a bare product of matrices or another
-library's search, and the others are divided by the fastest floor, which differs between processors. pytest-benchmark compares
-times with those of earlier runs (`--benchmark-compare`), but no ratios within a run.
+Times of two machines cannot be compared. So each group of benchmarks contains floors, such as a bare product of matrices or the
+search of another library. The time of each other benchmark is divided by that of the fastest floor, which differs between
+processors. pytest-benchmark itself compares times with those of earlier runs (`--benchmark-compare`), but no ratios within a run.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from typing import Any
 from bench.core.errors import UserError
 from leaderboard.regression import RegressionResult, Verdict
 
-TOLERANCE = 2.0  # factor; a busy machine causes less
-FLOORS = ("bare_product", "random words", "faiss")  # in the names of the benchmarks that others are divided by
+TOLERANCE = 2.0  # factor; a busy machine changes ratios by less
+FLOORS = ("bare_product", "random words", "faiss")  # parts of the names of the benchmarks that are floors
 
 Ratios = Mapping[str, float]
 
@@ -28,25 +28,25 @@ def load_ratios(path: Path) -> Ratios:
     Raises
     ------
     UserError
-        if the file is missing, or holds something else.
+        if the file is missing or has other content.
     """
     content = _load_json(path)
     if not isinstance(content, dict) or not all(isinstance(value, (int, float)) for value in content.values()):
-        raise UserError(f"{path}: expected ratios, a number for each benchmark's name")
+        raise UserError(f"{path}: expected an object of ratios, with a number for the name of each benchmark")
     return content
 
 
 def compute_ratios(path: Path) -> Ratios:
-    """Return the shortest time of each benchmark divided by that of its group's fastest floor, from a `--benchmark-json` file.
+    """Return the ratios of a `--benchmark-json` file: shortest time of a benchmark over that of the fastest floor of its group.
 
     Raises
     ------
     UserError
-        if the file is missing, or holds something else.
+        if the file is missing or has other content.
     """
     content = _load_json(path)
     if not isinstance(content, dict) or "benchmarks" not in content:
-        raise UserError(f"{path}: not what pytest --benchmark-json wrote")
+        raise UserError(f"{path}: not a file of pytest --benchmark-json")
     groups: dict[str, dict[str, float]] = {}
     for benchmark in content["benchmarks"]:
         groups.setdefault(str(benchmark["group"]), {})[benchmark["name"]] = benchmark["stats"]["min"]
@@ -59,7 +59,7 @@ def compute_ratios(path: Path) -> Ratios:
 
 
 def compare(baseline: Ratios, measured: Ratios) -> list[RegressionResult]:
-    """Compare each benchmark of either side."""
+    """Compare the ratios of all benchmarks of both sides."""
     return [_compare_ratio(name, baseline.get(name), measured.get(name)) for name in sorted({*baseline, *measured})]
 
 
@@ -82,4 +82,4 @@ def _load_json(path: Path) -> Any:
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
-        raise UserError(f"{path}: no JSON ({error})") from error
+        raise UserError(f"{path}: not valid JSON ({error})") from error

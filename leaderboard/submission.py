@@ -1,7 +1,7 @@
-"""Checks submitted records: schema, hashes, consistency with a new plan, and whether a sample of them can be reproduced.
+"""Checks submitted records: schema, hashes, consistency with a new plan, and reproducibility of a sample of them.
 
-A sample of the records is computed again. Attacks then run in a process that never holds the secret
-(`bench.runner.attack_process`), so that an attack that read the secret cannot repeat its numbers.
+The sample is computed again. Attacks then run in a process that never holds the secret (`bench.runner.attack_process`). So an
+attack that read the secret cannot repeat its numbers.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ P = TypeVar("P", bound=Plugin)
 SCHEMAS = {1: ASSETS / "record.schema.json", records.SCHEMA: ASSETS / "record-2.schema.json"}
 BUILTIN = "builtin"  # the photographs of every installation
 MAX_LENGTH = 160  # characters of a value in a message
-ROUNDING = 1e-9  # relative difference between computers of numbers that follow from the configuration alone
+ROUNDING = 1e-9  # tolerated relative difference of numbers that follow from the configuration alone
 
 
 @dataclass(frozen=True, order=True)
@@ -60,19 +60,19 @@ class NumberedRecord:
 def check(
     path: Path, *, images: Path | None = None, files: Sequence[Path] = (), sample: int = 3, seed: int = 0
 ) -> tuple[int, list[Fault]]:
-    """Return the number of lines, and their faults.
+    """Return the number of lines of a file of records, and the faults in them.
 
     Parameters
     ----------
     images : the photographs, if they are not the built-in ones
     files : dictionaries and networks that the records name by digest
     sample : number of records to compute again
-    seed : of the sample
+    seed : selects these records
 
     Raises
     ------
     UserError
-        if there is no such file, or no such `images` or `files`.
+        if the file, `images` or one of `files` does not exist.
     """
     if not path.is_file():
         raise UserError(f"{path}: no such file")
@@ -108,7 +108,7 @@ def _parse_lines(texts: Sequence[bytes]) -> Iterator[NumberedRecord | Fault]:
         try:
             record = json.loads(text, parse_constant=_refuse)
         except ValueError as error:
-            yield Fault(number, f"no JSON: {error}")
+            yield Fault(number, f"not valid JSON: {error}")
             continue
         version = record.get("schema") if isinstance(record, dict) else None
         validator = validators[version if version == 1 else records.SCHEMA]
@@ -125,18 +125,18 @@ def _parse_lines(texts: Sequence[bytes]) -> Iterator[NumberedRecord | Fault]:
 
 
 def _refuse(constant: str) -> None:
-    raise ValueError(f"{constant} is no number of JSON")
+    raise ValueError(f"{constant} is not a number of JSON")
 
 
 def _find_non_finite(value: Any, path: str = "") -> str | None:
-    """Return the path of a number that JSON can write and no double can hold, such as 1e999."""
+    """Return the path of a number that JSON can express and a double cannot, such as 1e999; None if there is none."""
     if isinstance(value, dict):
         return next((part for name, inner in value.items() if (part := _find_non_finite(inner, f"{path}.{name}"))), None)
     return path.lstrip(".") if isinstance(value, float) and not math.isfinite(value) else None
 
 
 def _check_consistency(record: Record) -> Iterator[str]:
-    """Yield hashes that do not match their content, and metrics outside of their range."""
+    """Yield a message for each hash that does not match its content, and for each metric outside its range."""
     task = {"name": record["task"], **record["task_settings"]}
     configured = (task, record["defense"], record["attack"], record["dataset"], record["seed"], record["metric_settings"])
     if (expected := records.experiment_id(*configured)) != record["experiment_id"]:
@@ -147,18 +147,18 @@ def _check_consistency(record: Record) -> Iterator[str]:
     for name, value in record["metrics"].items():
         if name in known and value is not None and not known[name].range[0] <= value <= known[name].range[1]:
             low, high = known[name].range
-            yield f"metrics.{name}: {value:g} is not from {low:g} to {high:g}"
+            yield f"metrics.{name}: {value:g} is outside the range from {low:g} to {high:g}"
     if record["status"] == "ok" and record["privacy"]["keypoints"] != record["metrics"]["keypoints"]:
-        yield "privacy.keypoints: not the keypoints of metrics"
+        yield "privacy.keypoints: differs from metrics.keypoints"
 
 
 def _find_duplicates(lines: Sequence[NumberedRecord]) -> Iterator[Fault]:
-    """Yield samples of an experiment that occur twice; a failed one may occur again."""
+    """Yield a fault for each sample of an experiment that occurs twice. A failed sample may occur again."""
     seen: dict[tuple[str, str], NumberedRecord] = {}
     for line in lines:
         key = line.record["experiment_id"], line.record["sample"]
         if key in seen and seen[key].record["status"] != "failed":
-            yield Fault(line.number, f"the same sample of the same experiment as line {seen[key].number}")
+            yield Fault(line.number, f"repeats the sample and experiment of line {seen[key].number}")
         seen[key] = line
 
 
@@ -184,7 +184,7 @@ class _LocalInputs:
         if record["dataset"]["spec"] is not None or record["dataset"]["name"] == BUILTIN:
             return None
         if self.images is None:
-            raise UserError(f"cannot be checked without the photographs of {record['dataset']['name']}: give --images")
+            raise UserError(f"cannot be checked without the photographs of {record['dataset']['name']}; pass them by --images")
         return self.images
 
     def plugin(self, kind: Kind[P], configuration: Mapping[str, Any]) -> P:
@@ -193,7 +193,7 @@ class _LocalInputs:
         Raises
         ------
         UserError
-            if it is not installed, or refuses a field.
+            if the plugin is not installed or does not accept the value of a field.
         """
         plugin = discovery.load_plugin(kind, configuration["name"])
         types = fields.resolve_types(plugin)
@@ -249,7 +249,7 @@ def _build_configuration(record: Record, inputs: _LocalInputs) -> RunConfigurati
 
 
 def _check_experiment(experiment: Experiment, members: Sequence[NumberedRecord], plan: Plan) -> Iterator[Fault]:
-    """Yield contradictions in an experiment: other inputs, a pair that does not apply, another guarantee, missing samples."""
+    """Yield a fault for each contradiction: other inputs, a pair that does not apply, another guarantee, missing samples."""
     first = members[0]
     if experiment.metadata["experiment_id"] != first.record["experiment_id"]:
         yield Fault(
@@ -281,7 +281,7 @@ def _find_difference(record: Record, local: Record) -> str:
         for name in (*theirs, *ours):
             if theirs.get(name) != ours.get(name) and (part != "dataset" or name not in ("name", "spec")):
                 values = f"{_shorten(theirs.get(name))}, here {_shorten(ours.get(name))}"
-                return f"{part}.{name} is {values} (give its file by --file?)"
+                return f"{part}.{name} is {values} (pass the file by --file if it is not the shipped one)"
     return "its configuration is the same"
 
 
@@ -289,7 +289,7 @@ def _find_difference(record: Record, local: Record) -> str:
 
 
 def _repeat_sample(completed: Sequence[tuple[Plan, Experiment, NumberedRecord]], sample: int, seed: int) -> Iterator[Fault]:
-    """Compute a sample of the records again, in a process without the secret, and yield what differs."""
+    """Compute a sample of the records again, in a process without the secret, and yield a fault for each difference."""
     usable = [one for one in completed if one[1].metadata["experiment_id"] == one[2].record["experiment_id"]]
     selection = np.sort(np.random.default_rng(seed).permutation(len(usable))[:sample])
     with Progress("computed again", len(selection)) as progress:
@@ -318,7 +318,7 @@ def _compare(line: NumberedRecord, repeated: Record | None) -> Iterator[Fault]:
         else:
             equal = abs(theirs - ours) <= ABSOLUTE_TOLERANCE + RELATIVE_TOLERANCE * abs(ours)
         if not equal:
-            values = f"is {_format_number(theirs)}, and {_format_number(ours)} when it is computed again"
+            values = f"is {_format_number(theirs)}, but {_format_number(ours)} when computed again"
             yield Fault(line.number, f"metrics.{name}: {values}")
 
 
@@ -332,19 +332,19 @@ def _format_number(value: float | None) -> str:
 
 
 def _shorten(value: Any) -> str:
-    """Return one short line of printable characters."""
+    """Return the value as one short line of printable characters."""
     text = " ".join(str(value).split())
     text = "".join(letter if letter.isprintable() else "?" for letter in text)
     return text if len(text) <= MAX_LENGTH else text[: MAX_LENGTH - 3] + "..."
 
 
 def _read_digest(path: Path) -> str:
-    """Return the digest of a file in records, from its header.
+    """Return the digest by which records name a file, from its header.
 
     Raises
     ------
     UserError
-        if it is no safetensors file of this program.
+        if it is not a safetensors file of this program.
     """
     from safetensors import SafetensorError, safe_open
 
@@ -352,7 +352,7 @@ def _read_digest(path: Path) -> str:
         with safe_open(path, framework="numpy") as opened:
             return str((opened.metadata() or {})["digest"])
     except (OSError, SafetensorError, KeyError) as error:
-        raise UserError(f"--file {path}: no dictionary or network of this program ({error})") from None
+        raise UserError(f"--file {path}: not a dictionary or network of this program ({error})") from None
 
 
 def format_faults(faults: Iterable[Fault]) -> Iterator[str]:

@@ -1,4 +1,4 @@
-"""Tables of a run's records: one row for each defense and attack, for a terminal and for report.md and report.csv."""
+"""Builds tables of the records of a run, with a row for each defense and attack: for a terminal, report.md and report.csv."""
 
 from __future__ import annotations
 
@@ -19,29 +19,29 @@ if TYPE_CHECKING:
 
 Configuration = dict[str, Any] | None
 
-# The metrics that come first, in this order; others follow by name.
+# The metrics that come first, in this order. The others follow by name.
 PAPER_METRICS = ("mae", "mse", "ssim", "psnr")
 FIRST_METRICS = ("keypoints", *PAPER_METRICS)
 FRACTION_PREFIX = "recall_"  # of metrics that are 1 or 0 for each sample
 MEDIAN_METRICS = ("translation_error", "rotation_error")  # over all samples; one without a value was not localized: the worst
 SEED_REMARK = "Releases are seeded: they are for measuring, and not private."
 COMPOSITION_REMARK = (
-    "ε/image: the median over photographs of what their keypoints spend together, by the smaller of basic composition and the "
-    f"optimal one at δ = {DELTA:g} (Kairouz, Oh and Viswanath). Not covered: {', '.join(UNCOVERED)}."
+    "ε/image: the median over photographs of the total ε of their keypoints, by the smaller of basic composition and optimal "
+    f"composition at δ = {DELTA:g} (Kairouz, Oh and Viswanath). Not covered: {', '.join(UNCOVERED)}."
 )
-MAX_FAILURES = 10  # that are listed
-MOST_DIGITS, LARGE = 1e4, 1e7  # numbers between these are written out
+MAX_FAILURES = 10  # failures that are listed
+MOST_DIGITS, LARGE = 1e4, 1e7  # numbers between these are written with all digits
 FILE_ONLY_COLUMNS = ("MSE", "angle", "l2")  # a terminal has no room for them
 
 
 def build_tables(records: Iterable[Record], *, brief: bool = False, foldable: bool = False) -> list[Table]:
     """Return a table of the latest records for each task, dataset (with its extractor), seed and condition.
 
-    A row has the mean of each metric over the photographs that have it, or the median over all for `MEDIAN_METRICS`, and Wilson's
-    interval for fractions. What does not apply is missing, and its note says why.
+    A row has the mean of each metric over the photographs that have it, or the median over all photographs for `MEDIAN_METRICS`.
+    Fractions have Wilson's interval. Values that do not apply are missing, and a note gives the reason.
 
-    `brief` tables are for a terminal: without `FILE_ONLY_COLUMNS`, with numbered notes. In `foldable` ones labels may be broken
-    between fields, and can no longer be copied into a command.
+    A `brief` table is for a terminal: it lacks `FILE_ONLY_COLUMNS` and has numbered notes. In a `foldable` table, the labels have
+    line breaks between fields, so they cannot be copied into a command.
     """
     groups = _group_by(
         keep_latest(records), lambda record: [record["task"], record.get("task_settings"), record["dataset"], record["seed"]]
@@ -59,7 +59,7 @@ _NOUNS: Mapping[str, str] = {"localization": "query", "structure": "scene", "mat
 
 
 def build_labels(pairs: Sequence[tuple[Configuration, Configuration]]) -> list[tuple[str, str]]:
-    """Return short names of defenses and attacks, `ldp:epsilon=10,subset_size=2`; with digests only to tell equal ones apart."""
+    """Return short names of defenses and attacks, such as `ldp:epsilon=10,subset_size=2`. Equal names get digests as well."""
     short = [(_label(defense), _label(attack)) for defense, attack in pairs]
     contents: dict[tuple[str, str], set[str]] = {}
     for names, pair in zip(short, pairs, strict=True):
@@ -76,13 +76,13 @@ def add_breaks(label: str) -> str:
 
 
 def label_extractor(configuration: dict[str, Any]) -> str:
-    """Return an extractor's name, and whether its descriptors are upright or oriented where that is a setting."""
+    """Return an extractor's name, followed by "upright" or "oriented" if that is one of its settings."""
     words = {True: " upright", False: " oriented"}
     return configuration["name"] + words.get(configuration.get("upright"), "")  # type: ignore[arg-type]
 
 
 def _split_by_condition(records: list[Record]) -> list[list[Record]]:
-    """Return the records of each condition, with those that hold for every sample."""
+    """Return the records of each condition, with the n/a records, which hold for all samples."""
     conditions = dict.fromkeys(record.get("condition") for record in records if record["status"] != "n/a") or {None: None}
     return [
         [record for record in records if record["status"] == "n/a" or record.get("condition") == condition]
@@ -135,7 +135,7 @@ def _describe_samples(records: list[Record]) -> str:
 
 
 def _collect_values(records: list[Record], labels: tuple[str, str], metrics: Sequence[str]) -> dict[str, Any]:
-    """Return the values of an experiment's row by name; what does not apply is None."""
+    """Return the values of an experiment's row by name. Values that do not apply are None."""
     completed = [record for record in records if record["status"] == "ok"]
     applies, privacy = records[0]["status"] != "n/a", records[0]["privacy"]
     return {
@@ -178,16 +178,16 @@ def _explain_metrics(metrics: Sequence[str]) -> list[str]:
 
 
 def _list_notes(records: list[Record], completed: list[Record]) -> list[str]:
-    """Return why the experiment does not apply, or what all its samples share."""
+    """Return the reason why the experiment does not apply, or the notes that hold for all its samples."""
     if records[0]["status"] == "n/a":
         return [records[0]["reason"]]
     if not completed:
-        return ["no photograph could be done"]
+        return ["every sample failed"]
     uncovered = [part for part in records[0]["privacy"].get("uncovered", ()) if part not in UNCOVERED]
     shared = [note for note in completed[0]["notes"] if all(note in record["notes"] for record in completed)]
-    beyond = [f"not covered either: {', '.join(uncovered)}"] if uncovered else []
+    beyond = [f"also not covered: {', '.join(uncovered)}"] if uncovered else []
     by_distance = records[0]["privacy"].get("epsilon_per_distance")
-    other = [] if by_distance is None else [f"another promise than ε-LDP: ε = {format_number(by_distance)} per unit of distance"]
+    other = [] if by_distance is None else [f"not ε-LDP: ε = {format_number(by_distance)} per unit of distance"]
     return [*other, *shared, *beyond]
 
 
@@ -203,13 +203,13 @@ def _list_failures(experiments: Sequence[list[Record]], labels: Sequence[tuple[s
 
 
 def spent_epsilon(privacy: dict[str, Any]) -> float | None:
-    """Return the smaller ε of an image among the two compositions; older records have one alone."""
+    """Return the smaller ε of an image of the two compositions. Older records have only one of them."""
     known = [float(privacy[name]) for name in ("epsilon_image", "epsilon_image_optimal") if privacy.get(name) is not None]
     return min(known, default=None)
 
 
 def _list_metrics(records: list[Record]) -> tuple[str, ...]:
-    """Return the metrics that some record has a value of."""
+    """Return the metrics with a value in at least one record."""
     names = {name for record in records for name, value in record["metrics"].items() if value is not None}
     return (*(name for name in FIRST_METRICS if name in names), *sorted(names - set(FIRST_METRICS)))
 
@@ -260,7 +260,7 @@ def _median(values: Iterable[float | None]) -> float | None:
 
 
 def _average(name: str, values: list[float | None]) -> float | Interval | None:
-    """Return the average of a metric over the samples; for a fraction of samples with its interval."""
+    """Return the average of a metric over the samples. A fraction of samples comes with its interval."""
     from leaderboard.intervals import proportion  # expensive: imports scipy
 
     if name in MEDIAN_METRICS:
@@ -272,12 +272,12 @@ def _average(name: str, values: list[float | None]) -> float | Interval | None:
 
 
 def format_number(value: float) -> str:
-    """Return four digits, and more before the point if needed; a missing number is n/a."""
+    """Return a number with four digits, or more before the decimal point if needed. NaN is n/a."""
     if math.isnan(value) or math.isinf(value):
         return NOT_APPLICABLE if math.isnan(value) else "∞"
     return f"{value:.0f}" if MOST_DIGITS <= abs(value) < LARGE else f"{value:.4g}"
 
 
 def format_chance(log10: float) -> str:
-    """Return a probability from its decimal logarithm, which may be far below what a float can hold."""
+    """Return a probability as text, from its decimal logarithm. It may be too small for a float."""
     return f"{10**log10:.4g}" if log10 > -5 else f"10^{log10:.1f}"

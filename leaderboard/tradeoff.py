@@ -1,4 +1,4 @@
-"""Privacy against utility: what the strongest attack recovers of a defense, and what a server can do with it."""
+"""Privacy-utility tradeoffs: the score of the strongest attack on a defense, and the score of the server's task."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ class Point:
     utility_experiment: GroupedExperiment
     privacy: Interval  # smaller is better
     utility: Interval  # larger is better
-    on_front: bool  # the Pareto front
-    own_dictionaries: bool  # the two experiments use different dictionaries
+    on_front: bool  # whether it lies on the Pareto front
+    own_dictionaries: bool  # whether the two experiments use different dictionaries
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -48,7 +48,7 @@ class Tradeoff:
         settings = f" ({self.utility_group.settings})" if self.utility_group.settings else ""
         if attacked["hash"] == served["hash"]:
             return f"{condition}{self.privacy.label} and {self.utility.label} on {attacked['name']}{settings}"
-        words = "; words of a dictionary are those of each" if any(point.own_dictionaries for point in self.points) else ""
+        words = "; each with its own dictionary" if any(point.own_dictionaries for point in self.points) else ""
         return f"{condition}{self.privacy.label} on {attacked['name']}, {self.utility.label} on {served['name']}{settings}{words}"
 
     @property
@@ -60,7 +60,7 @@ class Tradeoff:
 def build_tradeoffs(attack_group: ComparisonGroup, groups: Sequence[ComparisonGroup]) -> list[Tradeoff]:
     """Return one tradeoff for each condition of each utility group with the same extractor, seeds and source.
 
-    Groups of other photographs count only where no group has the same, and matching only where localization is missing.
+    Groups on other photographs are used only if no group has the same photographs, and matching only if localization is missing.
     """
     for utility in list_measures(UTILITY):
         candidates = [one for one in groups if utility in one.measures and _shared_key(one) == _shared_key(attack_group)]
@@ -76,9 +76,9 @@ def build_tradeoffs(attack_group: ComparisonGroup, groups: Sequence[ComparisonGr
 
 
 def pareto(cost: ArrayLike, gain: ArrayLike) -> NDArray[np.bool_]:
-    """Return which of (n,) points no other point dominates, as (n,) booleans.
+    """Return whether each of (n,) points is dominated by no other point, as (n,) booleans.
 
-    A point dominates another if it costs no more, gains no less, and is better in one of the two.
+    A point dominates another if it costs no more, gains no less, and is better in at least one of the two.
     """
     costs, gains = np.asarray(cost, dtype=np.float64), np.asarray(gain, dtype=np.float64)
     no_worse = (costs[None] <= costs[:, None]) & (gains[None] >= gains[:, None])
@@ -127,8 +127,8 @@ def _build_tradeoff(
 def _find_same_defense(standing: Standing, experiments: Sequence[GroupedExperiment]) -> GroupedExperiment | None:
     """Return the experiment of a utility group with the same defense and setting.
 
-    On another dataset a defense may have other files, such as the dictionary of that scene. There the defense is the same if all
-    other fields are equal and no second experiment qualifies.
+    On another dataset a defense may have other files, such as the dictionary of that scene. The defense is then the same if all
+    other fields are equal and only one experiment qualifies.
     """
     equal = [one for one in experiments if one.metadata["defense"] == standing.configuration]
     content = standing.experiments[0].metadata["dataset"]["hash"]

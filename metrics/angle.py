@@ -16,8 +16,8 @@ from bench.types import Floats
 class Angle(Metric):
     """Mean angle between a true descriptor and its estimate.
 
-    Of unit vectors u, v it is 2 atan2(|u − v|, |u + v|) (Kahan), which loses no digits near 0° and 180° as arccos does.
-    An estimate of zeros points nowhere and counts as 90°.
+    The angle of unit vectors u and v is 2 atan2(|u − v|, |u + v|) (Kahan). Unlike arccos, this loses no digits near 0° and 180°.
+    An estimate of zeros has no direction and counts as 90°.
     """
 
     compares: ClassVar[Literal["images", "descriptors"]] = "descriptors"

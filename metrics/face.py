@@ -1,4 +1,4 @@
-"""Faces that a detector still finds: the cascade of local binary patterns shipped in scikit-image's wheel."""
+"""Detection rate of faces, by the cascade of local binary patterns in scikit-image's wheel."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from bench.types import Floats
 
 @dataclass(frozen=True, kw_only=True)
 class Face(Metric):
-    """Fraction of the photograph's detected faces that are detected again at the same position; none without a face.
+    """Fraction of the photograph's detected faces that are detected again at the same position; none if it has no face.
 
     A face is detected again if a detection in the estimate overlaps it by an intersection over union of at least `overlap`. So a
-    face that a network hallucinates elsewhere does not count. The metric detects a person, not an identity.
+    hallucinated face at another position does not count. The metric detects faces and identifies nobody.
     """
 
     compares: ClassVar[Literal["images", "descriptors"]] = "images"
     unit: ClassVar[str] = "fraction"
     range: ClassVar[tuple[float, float]] = (0.0, 1.0)
     higher_is_better_for: ClassVar[Literal["attacker", "defender"]] = "attacker"
-    # Of the detector, whose training window is 24 pixels wide, and of the comparison.
+    # Parameters of the detector, whose training window is 24 pixels wide, and of the comparison.
     parameters: ClassVar[Mapping[str, Any]] = MappingProxyType(
         {"cascade": "lbpcascade_frontalface", "scale_factor": 1.1, "step_ratio": 1.0, "smallest": 32, "overlap": 0.5}
     )
@@ -44,17 +44,17 @@ class Face(Metric):
 
 
 def compute_overlap(one: Doubles, other: Doubles) -> Doubles:
-    """Intersection over union of boxes (..., 4): top, left, height, width in pixels. -> (...)"""
+    """Return the intersection over union of boxes. (..., 4) top, left, height and width in pixels -> (...)"""
     low = np.maximum(one[..., :2], other[..., :2])
     high = np.minimum(one[..., :2] + one[..., 2:], other[..., :2] + other[..., 2:])
     intersection = np.clip(high - low, 0, None).prod(axis=-1)
     return intersection / (one[..., 2:].prod(axis=-1) + other[..., 2:].prod(axis=-1) - intersection)
 
 
-# All attacks on a photograph share its detections.
+# The cache lets all attacks on a photograph share its detections.
 @functools.lru_cache(maxsize=2)
 def _detect_faces(pixels: bytes, shape: tuple[int, int, int]) -> Doubles:
-    """Detect faces in a float64 image, as boxes (F, 4)."""
+    """Return the faces that are detected in a float64 image, as boxes (F, 4)."""
     image = np.frombuffer(pixels).reshape(shape)
     smallest, settings = Face.parameters["smallest"], Face.parameters
     detections = _load_detector().detect_multi_scale(

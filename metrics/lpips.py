@@ -1,4 +1,4 @@
-"""Learned perceptual distance (Zhang et al., CVPR 2018), with the user's weights of its network."""
+"""Learned perceptual distance (Zhang et al., CVPR 2018), with weights that the user supplies."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ class LPIPS(Metric):
 
     def __post_init__(self) -> None:
         if importlib.util.find_spec("lpips") is None:
-            raise UserError("lpips: its library is not installed; pip install 'feature-privacy-bench[lpips]'")
+            raise UserError("lpips: its library is not installed; install it with pip install 'feature-privacy-bench[lpips]'")
         if not self.weights.is_file():
-            raise UserError(f"lpips: {self.weights}: no such file; it is torchvision's alexnet-owt-7be5be79.pth")
+            raise UserError(f"lpips: {self.weights}: no such file; pass the path of torchvision's alexnet-owt-7be5be79.pth")
         _load_network(self.weights)
 
     def __call__(self, truth: Floats, estimate: Floats) -> float:
@@ -51,7 +51,7 @@ class LPIPS(Metric):
 
 
 def _to_tensor(image: Doubles) -> Any:
-    """(H, W, 3) -> (1, 3, H, W) float32"""
+    """Return an image as a tensor. (H, W, 3) -> (1, 3, H, W) float32"""
     import torch
 
     return torch.from_numpy(image.astype("float32")).permute(2, 0, 1)[None]
@@ -64,14 +64,14 @@ def _load_network(weights: Path) -> Any:
     Raises
     ------
     UserError
-        if they are not AlexNet's.
+        if the file does not hold torchvision's weights of AlexNet.
     """
     import lpips
     import torch
 
     settings = LPIPS.parameters
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the library calls torchvision by a deprecated interface
+        warnings.simplefilter("ignore")  # the library uses a deprecated interface of torchvision
         network = lpips.LPIPS(net=settings["network"], version=settings["version"], pnet_rand=True, verbose=False)
     layers = network.net.state_dict()  # slice1.0.weight for features.0.weight
     try:

@@ -15,7 +15,7 @@ from bench.types import Floats
 
 @dataclass(frozen=True, kw_only=True)
 class PSNR(Metric):
-    """Peak signal-to-noise ratio, 10 log10(1 / MSE); none where the images are equal."""
+    """Peak signal-to-noise ratio, 10 log10(1 / MSE); none if the images are equal."""
 
     compares: ClassVar[Literal["images", "descriptors"]] = "images"
     unit: ClassVar[str] = "dB"

@@ -12,12 +12,12 @@ from bench.types import Floats
 
 @dataclass(frozen=True, kw_only=True)
 class Recovered(Metric):
-    """Fraction of keypoints whose true descriptor is, of all in the photograph, the one nearest to the estimate.
+    """Fraction of keypoints whose estimate is nearest to their own true descriptor, among all in the photograph.
 
     (1 / N) · |{i : t_i = t_j(i)}| with j(i) = argmax_j cos(t_j, e_i), where t are the true descriptors and e the estimates.
-    The candidates are the N true descriptors of the same photograph; ties go to the lowest index; equal descriptors count
-    as one candidate. The chance level is 1 / N, for N different descriptors. An attacker without information about a keypoint
-    does no better, for any constant estimate.
+    The candidates are the N true descriptors of the same photograph. Ties go to the lowest index, and equal descriptors count as
+    one candidate. For N different descriptors the chance level is 1 / N. Every constant estimate has this score, and an attacker
+    without information about the keypoints does no better.
     """
 
     compares: ClassVar[Literal["images", "descriptors"]] = "descriptors"

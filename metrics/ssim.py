@@ -19,7 +19,7 @@ class SSIM(LocalMetric):
     unit: ClassVar[str] = "similarity"
     range: ClassVar[tuple[float, float]] = (-1.0, 1.0)
     higher_is_better_for: ClassVar[Literal["attacker", "defender"]] = "attacker"
-    # SSIM depends on these settings. Both sides of an image must have at least 11 pixels, the window's width.
+    # SSIM depends on these settings. Both sides of an image must have at least 11 pixels, which is the window's width.
     parameters: ClassVar[Mapping[str, Any]] = MappingProxyType(
         {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 1.0, "channel_axis": 2}
     )

@@ -1,1 +1,1 @@
-"""Suites, one file each, which sets `SUITE`; `bench sweep` finds them by file name."""
+"""Suites of experiments. Each file sets `SUITE`, and `bench sweep` finds it by file name."""

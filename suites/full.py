@@ -1,4 +1,4 @@
-"""All other suites. Shared experiments run once."""
+"""All other suites. Experiments that suites share run once."""
 
 from bench.runner import suite
 from bench.runner.suite import Suite

@@ -1,4 +1,4 @@
-"""Reconstruction and localization of the same queries: same images, words, ε and m for both."""
+"""Reconstruction and localization of the same queries, with the same images, words, ε and m."""
 
 from attacks.dia import DIA
 from attacks.keypoints import Keypoints

@@ -1,4 +1,4 @@
-"""A run of seconds: one defense per kind of release, and the cheapest attacks."""
+"""A run of a few seconds: one defense per kind of release, and the fastest attacks."""
 
 from attacks.dia import DIA
 from attacks.keypoints import Keypoints
@@ -14,6 +14,6 @@ SUITE = Suite(
     parts=grid(
         defenses=[Undefended(), Affine(), LDP()],
         attacks=[Keypoints(), DIA(), Nearest()],
-        images=[source for source in photographs.list_builtin() if source.name == "rocket"],  # it has the fewest keypoints
+        images=[source for source in photographs.list_builtin() if source.name == "rocket"],  # the one with the fewest keypoints
     ),
 )

@@ -1,4 +1,4 @@
-"""Fixtures that several tests share."""
+"""Fixtures of several test files."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,7 +13,7 @@ SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 @pytest.fixture(scope="session", autouse=True)
 def _cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """What tests keep is theirs alone, and goes with them."""
+    """Give the tests a cache folder of their own."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(store.VARIABLE, str(tmp_path_factory.mktemp("cache")))
         yield
@@ -26,7 +26,7 @@ def rng() -> np.random.Generator:
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
-    """The photographs that the project is tuned and measured on, where they are; they are no part of it."""
+    """The photographs that the project is tuned and measured on. They are no part of it, so tests skip without them."""
     if not SHARED.is_dir():
         pytest.skip("needs ../shared/data, which is not here")
     return SHARED

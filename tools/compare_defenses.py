@@ -1,16 +1,17 @@
 """Compares defenses with the same ε: the reconstruction of an attacker trained for each, and the localization by a server.
 
-    python tools/compare_defenses.py --data ../shared/data --work work/better
+    python tools/compare_defenses.py --data ../shared/data --work work/defenses
 
 |K| is 8,000 instead of the paper's 256,000, and its ε of 10 and 12 are reduced by ln 32, so that the chance of the true word in
 `ldp` is the same. Each network starts from one for raw descriptors. All are trained equally long, for all settings of their
 defense, on photographs that the shipped dictionary was not built from. No choice was made on the test data: `test.txt`, the
-built-in photographs, and the gallery. Finished trainings and measurements are reused. Writes docs/better.md.
+built-in photographs, and the gallery. Finished trainings and measurements are reused. Writes docs/results/better-defenses.md.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -18,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 from make_assets import split_photographs
+from result_page import format_interval, write_page
 
 import bench
 from attacks.dia import DIA
@@ -41,7 +43,6 @@ from defenses.none import Undefended
 from defenses.privunit import expected_cosine
 from leaderboard.intervals import Interval, interval, proportion
 
-PAGE = Path(__file__).parents[1] / "docs" / "better.md"
 WORDS, SHIFT = 8000, math.log(32)  # 256,000 words over these
 PAPER_EPSILONS = (10, 12)  # ε of the paper's size
 BATCH, RATE = 8, 1e-3
@@ -96,7 +97,7 @@ def main() -> None:
     if args.only in (None, "attacks"):
         study.attack(networks)
     if args.only is None:
-        PAGE.write_text("\n".join(write_page(study, networks)), encoding="utf-8")
+        write_results(study, networks)
 
 
 def list_rows() -> list[tuple[str, str, str]]:
@@ -171,10 +172,10 @@ class Study:
                     results.setdefault(defense, {}).setdefault(attack, []).append(record)
         return results
 
-    def attack_positions(self) -> np.ndarray:
-        """Return the SSIM of reconstructions from positions alone, which every defense releases, on the same photographs."""
+    def attack_positions(self) -> list[Record]:
+        """Reconstruct the same photographs from positions alone, which every defense releases."""
         both = [bench.run([Undefended()], [Keypoints()], images, out=self.work / "attacks") for images in (self.tested, None)]
-        return np.array([record["metrics"]["ssim"] for records in both for record in records])
+        return [record for records in both for record in records]
 
     def localize(self) -> dict[str, list[Record]]:
         """Localize queries. -> defense -> records"""
@@ -189,34 +190,34 @@ def _read_defense(text: str, dictionary: str = "") -> Defense:
     return spec.read(f"{text},dictionary={dictionary}" if dictionary else text, discovery.DEFENSE)
 
 
-def write_page(study: Study, networks: Mapping[str, Path]) -> list[str]:
-    attacked, served, alone = study.attack(networks), study.localize(), study.attack_positions()
-    return [
-        write_heading(study, networks, alone),
+def write_results(study: Study, networks: Mapping[str, Path]) -> None:
+    attacked, served, positions = study.attack(networks), study.localize(), study.attack_positions()
+    alone = np.array([record["metrics"]["ssim"] for record in positions])
+    lines = [
+        write_heading(study, alone),
         *write_table(attacked, served),
         "",
         *compare_rows(attacked, served, alone),
         "",
         *write_reasons(),
-        "",
     ]
+    by_attack = (group for groups in attacked.values() for group in groups.values())
+    records = itertools.chain(positions, *by_attack, *served.values())
+    start = {"initial_checkpoint": weights.load(study.initial_checkpoint).digest}
+    write_page("better-defenses.md", "\n".join(lines), [start, *records])
 
 
-def write_heading(study: Study, networks: Mapping[str, Path], alone: np.ndarray) -> str:
+def write_heading(study: Study, alone: np.ndarray) -> str:
     widths = ", ".join(map(str, study.widths))
     return (
-        "# Better defenses at the same ε?\n\n"
-        "Written by `tools/compare_defenses.py`, which rebuilds the networks and all numbers here:\n\n"
-        "```\npython tools/compare_defenses.py --data ../shared/data --work work/better "
-        f"--initial-checkpoint {study.initial_checkpoint.name} --steps {study.steps} "
-        f"--tested {len(study.tested)} --queries {study.queries} --networks {' '.join(networks)}\n```\n\n"
+        "# Defenses at the same ε\n\n"
         f"|K| is {WORDS:,}: ε = {PAPER_EPSILONS[0] - SHIFT:.3f} releases the true word as often as "
         f"ε = {PAPER_EPSILONS[0]} with 256,000.\n\n"
         "- **SSIM**: quality of the reconstruction by `dia` with a network for that defense. Each network has "
         f"{widths} channels, started from `{study.initial_checkpoint.name}`, a network for raw descriptors, "
         f"and was trained for {study.steps} "
-        f"steps of {BATCH} crops of {len(study.photographs)} photographs, all alike. That is a short training: the results are "
-        "lower bounds of the leakage, and differences may grow or vanish with longer training. Each was trained once; intervals "
+        f"steps of {BATCH} samples from {len(study.photographs)} photographs. That is a short training: the results are lower "
+        "bounds of the leakage, and differences may grow or vanish with longer training. Each was trained once; intervals "
         f"do not include the variation between seeds. Measured on {len(study.tested)} photographs of `test.txt` and the 7 "
         "built-in, which no network was trained or chosen on.\n"
         "- Positions alone, which every defense releases, give "
@@ -261,7 +262,7 @@ def write_table(attacked: Attacked, served: Localized) -> list[str]:
 
 def compare_rows(attacked: Attacked, served: Localized, alone: np.ndarray) -> list[str]:
     """Write paired differences from the paper's defense at the same ε, and whether one is better in both."""
-    lines = [markdown_row(("ε", f"less `{BASE}`", "SSIM", "recall, points", "says")), markdown_row(["---"] * 5)]
+    lines = [markdown_row(("ε", f"minus `{BASE}`", "SSIM", "recall, points", "result")), markdown_row(["---"] * 5)]
     bases = {epsilon: text for epsilon, name, text in list_rows() if name == BASE}
     verdicts = []
     for epsilon, name, text in list_rows():
@@ -285,8 +286,8 @@ def write_reasons() -> list[str]:
         "",
         "- `plateau` releases a near word as often as the true one; with more near words, each is released less often. A near "
         "word helps a server only if the map's point has it; it always helps an attacker.",
-        "- `privunit` spreads ε over 127 dimensions: what it releases has a mean cosine with the (centred) descriptor of "
-        f"{cosines} at these ε. No choice of |K| helps it, and a network has use for each of its vectors.",
+        "- `privunit` spreads ε over 127 dimensions: a released vector has a mean cosine with the (centred) descriptor of "
+        f"{cosines} at these ε. No choice of |K| changes this, and each vector is information for a network.",
         "- `exponential` spends half of ε on normalisers that hardly differ, and the rest on utilities that few words have.",
     ]
 
@@ -294,27 +295,22 @@ def write_reasons() -> list[str]:
 def write_summary(verdicts: Sequence[tuple[str, str]]) -> str:
     """Write whether one of the rows dominates the paper's defense."""
     dominating = [name for name, verdict in verdicts if verdict == DOMINATES]
-    gaining = [name for name, verdict in verdicts if "server does more" in verdict]
+    gaining = [name for name, verdict in verdicts if "higher recall" in verdict]
     if dominating:
-        return f"Dominating `{BASE}`, with higher recall and less to be seen, beyond chance: {', '.join(dominating)}."
-    more = f"Recall is higher, beyond chance, for {', '.join(gaining)}." if gaining else "No recall is higher, beyond chance."
-    return f"**None is shown to dominate `{BASE}`**, by a higher recall at the same ε with less to be seen. {more}"
+        return f"These dominate `{BASE}`, with higher recall and lower SSIM at the same ε: {', '.join(dominating)}."
+    more = f"Recall is significantly higher for {', '.join(gaining)}." if gaining else "No recall is significantly higher."
+    return f"**None is shown to dominate `{BASE}`**, by higher recall and lower SSIM at the same ε. {more}"
 
 
 def describe_verdict(ssim: Interval, recall: Interval) -> str:
     """Describe the two differences: the attacker gains by a higher SSIM, the server by a higher recall."""
-    attacker = "sees more" if ssim.low > 0 else "sees less" if ssim.high < 0 else ""
-    server = "does more" if recall.low > 0 else "does less" if recall.high < 0 else ""
-    if server == "does more" and attacker != "sees more":
-        return DOMINATES if attacker else "server does more, attacker inconclusive"
-    if server == "does less" and attacker != "sees less":
-        return "is dominated" if attacker else "server does less, attacker inconclusive"
-    parts = [f"attacker {attacker}"] * bool(attacker) + [f"server {server}"] * bool(server)
-    return ", ".join(parts) or "inconclusive"
-
-
-def format_interval(value: Interval, digits: int, sign: str = "") -> str:
-    return f"{value.mean:{sign}.{digits}f} [{value.low:{sign}.{digits}f}, {value.high:{sign}.{digits}f}]"
+    attacker = "higher SSIM" if ssim.low > 0 else "lower SSIM" if ssim.high < 0 else ""
+    server = "higher recall" if recall.low > 0 else "lower recall" if recall.high < 0 else ""
+    if server == "higher recall" and attacker != "higher SSIM":
+        return DOMINATES if attacker else "higher recall, SSIM inconclusive"
+    if server == "lower recall" and attacker != "lower SSIM":
+        return "is dominated" if attacker else "lower recall, SSIM inconclusive"
+    return ", ".join(filter(None, (attacker, server))) or "inconclusive"
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Measures every attack at the same settings, and where the stronger ones fail, and writes docs/attacks.md.
+"""Measures every attack at the same settings, and where the stronger ones fail, and writes docs/results/attacks.md.
 
     python tools/measure_attacks.py --data ../shared/data --work work/attacks
 
@@ -8,7 +8,7 @@
    zeros of the descriptor.
 3. Milliseconds of one core per descriptor.
 
-Records in WORK are reused.
+Records in WORK are reused, and the results of 2. and 3. are cached for each photograph, so an interrupted run resumes.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from __future__ import annotations
 import argparse
 import functools
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from result_page import cache_arrays, format_interval, write_page
 
 import bench
 from attacks.lattice import Lattice
@@ -33,6 +33,7 @@ from bench.core.table import markdown_row
 from bench.extractors.sift import Sift
 from bench.geometry.lattice import find_unit_integer_points
 from bench.images import photographs
+from bench.images.photographs import Source
 from bench.registry import discovery, spec
 from bench.runner.other_releases import ReleasePool
 from bench.runner.records import Record
@@ -40,13 +41,12 @@ from bench.settings import Asset
 from bench.threat_model import DefenseDatabase, OtherReleases, PublicAssets, PublicDatabase
 from bench.types import Features, Subspaces
 from defenses.affine import Affine
-from leaderboard.intervals import Interval, interval
+from leaderboard.intervals import interval
 
-TABLE = Path(__file__).parents[1] / "docs" / "attacks.md"
-TITLE = """# What the attacks recover
+TITLE = """# Results of every attack
 
-Written by `tools/measure_attacks.py`: the seven built-in photographs, all keypoints, upright SIFT, seed 0, attacks as they are
-configured by default (`docs/tuning.md`). In brackets: 95% bootstrap over photographs.
+The releases are of the seven built-in photographs: all keypoints, upright SIFT, seed 0. The attacks have their default settings,
+[chosen on other photographs](tuning.md). In brackets: 95% intervals, by percentile bootstrap over photographs.
 """
 DIMS = (2, 4, 8, 16)
 SUBSPACES = tuple(f"affine:dim={dim}" for dim in DIMS)
@@ -56,6 +56,7 @@ ON_SUBSPACES = ("database", "clustering", "dia", "nearest", "lattice", "repeat",
 ON_WORD_SETS = ("dia", "context", "repeat", "repeat:releases=4", "keypoints")
 TIMED_ON = 2  # photographs
 TIMED = ("database", "clustering", "nearest", "lattice", "sparsity", "intersection", "dia")
+Results = Mapping[tuple[str, str], Sequence[Record]]  # defense, attack -> records
 SHOWN = {"recovered": 3, "angle": 1, "ssim": 3, "psnr": 2}  # metric -> digits
 EXACT = 1e-5  # distance below which an estimate counts as the descriptor
 RAW_ROWS = 16_000  # of the database of raw descriptors: as many as a sub-database has
@@ -69,43 +70,49 @@ def main() -> None:
     parser.add_argument("--work", type=Path, required=True, help="folder of records, reused between runs")
     args = parser.parse_args()
     args.work.mkdir(parents=True, exist_ok=True)
+    results = {
+        (defense, attack): run(defense, attack, args.work)
+        for defenses, attacks in ((SUBSPACES, ON_SUBSPACES), (WORD_SETS, ON_WORD_SETS))
+        for defense in defenses
+        for attack in attacks
+    }
     parts = [
         TITLE,
-        write_comparison("Subspaces", SUBSPACES, ON_SUBSPACES, "recovered", args.work),
-        write_comparison("Word sets", WORD_SETS, ON_WORD_SETS, "ssim", args.work),
+        write_comparison("Subspaces", SUBSPACES, ON_SUBSPACES, "recovered", results),
+        write_comparison("Word sets", WORD_SETS, ON_WORD_SETS, "ssim", results),
         write_exact(build_raw_database(args.data, args.work)),
         write_speed(),
     ]
-    TABLE.write_text("\n".join(parts), encoding="utf-8")
+    write_page("attacks.md", "\n".join(parts), (record for records in results.values() for record in records))
 
 
 # ---- all attacks at the same settings
 
 
-def write_comparison(title: str, defenses: Sequence[str], attacks: Sequence[str], by: str, work: Path) -> str:
+def write_comparison(title: str, defenses: Sequence[str], attacks: Sequence[str], by: str, results: Results) -> str:
     """Write a table of every attack against every defense, with paired differences from the first attack in the metric `by`."""
     lines = [
         f"## {title}",
         "",
-        "`recovered`: share of descriptors for which, of all in the photograph, the true one is nearest to the estimate. "
-        f"`angle`: in degrees. Then the difference in {by} from `{attacks[0]}` on the same photographs, and what the attack "
-        "says of its run on the first of them.",
+        "*recovered*: fraction of descriptors to which the estimate is nearer than to any other descriptor of the photograph. "
+        f"*angle*: from the true descriptor to the estimate, in degrees. *difference*: {by} minus that of `{attacks[0]}` on the "
+        "same photographs. *notes*: of the attack, on the first photograph.",
         "",
-        markdown_row(("defense", "attack", "recovered", "angle", "SSIM", "PSNR", f"{by} less {attacks[0]}'s", "it says")),
+        markdown_row(("defense", "attack", "recovered", "angle", "SSIM", "PSNR", "difference", "notes")),
         markdown_row(["---"] * 8),
     ]
-    strongest = []
+    highest = []
     for written in defenses:
-        results = {attack: run(written, attack, work) for attack in attacks}
-        first = list_values(results[attacks[0]], by)
-        for attack, records in results.items():
+        first = list_values(results[written, attacks[0]], by)
+        for attack in attacks:
+            records = results[written, attack]
             values = list_values(records, by)
             apart = "" if attack == attacks[0] or not len(values) else format_interval(interval(values - first), 3)
             columns = [format_values(records, metric, digits) for metric, digits in SHOWN.items()]
             lines.append(markdown_row((f"`{written}`", f"`{attack}`", *columns, apart, join_notes(records))))
-        means = {attack: values.mean() for attack, records in results.items() if len(values := list_values(records, by))}
-        strongest.append(f"`{max(means, key=lambda attack: means[attack])}` at `{written}`")
-    return "\n".join([*lines, "", f"Strongest by {by}: {', '.join(strongest)}.", ""])
+        means = {attack: values.mean() for attack in attacks if len(values := list_values(results[written, attack], by))}
+        highest.append(f"`{max(means, key=lambda attack: means[attack])}` at `{written}`")
+    return "\n".join([*lines, "", f"Highest {by}: {', '.join(highest)}.", ""])
 
 
 def run(defense: str, attack: str, work: Path) -> list[Record]:
@@ -121,10 +128,6 @@ def list_values(records: Sequence[Record], metric: str) -> np.ndarray:
 def format_values(records: Sequence[Record], metric: str, digits: int) -> str:
     values = list_values(records, metric)
     return format_interval(interval(values), digits) if len(values) else "n/a"
-
-
-def format_interval(value: Interval, digits: int) -> str:
-    return f"{value.mean:.{digits}f} [{value.low:.{digits}f}, {value.high:.{digits}f}]"
 
 
 def join_notes(records: Sequence[Record]) -> str:
@@ -149,29 +152,34 @@ def build_raw_database(data: Path, work: Path) -> Asset:
 
 def write_exact(raw: Asset) -> str:
     """Write the fractions that `sparsity` and `lattice` find exactly, on whole photographs."""
-    shares = [markdown_row(("dim", *COLUMNS)), markdown_row(["---"] * (1 + len(COLUMNS)))]
+    fractions = [markdown_row(("dim", *COLUMNS)), markdown_row(["---"] * (1 + len(COLUMNS)))]
     zeros = [markdown_row(("dim", *ZEROS)), markdown_row(["---"] * (1 + len(ZEROS)))]
+    secrets = extract_all()
     for dim in DIMS:
-        results = [list(find_exact(dim, secret, raw)) for secret in extract_all()]  # (photographs, columns) of (N,) bool
-        means = np.array([[hit.mean() for hit in hits] for hits in results])
-        shares.append(markdown_row((dim, *(format_interval(interval(column), 3) for column in means.T))))
-        hit = np.concatenate([hits[0] for hits in results])
-        beyond = np.concatenate([(secret.descriptors == 0).sum(axis=1) for secret in extract_all()]) - dim
+        results = []  # of each photograph
+        for source, secret in secrets.items():
+            inputs = [dim, source.content_hash(), *(PUBLIC.digest(database) for database in ("shipped", raw))]
+            results.append(cache_arrays("measure_attacks", inputs, functools.partial(find_exact, dim, secret, raw)))
+        means = np.array([[hits[column].mean() for column in COLUMNS] for hits in results])
+        fractions.append(markdown_row((dim, *(format_interval(interval(column), 3) for column in means.T))))
+        hit = np.concatenate([hits[COLUMNS[0]] for hits in results])
+        beyond = np.concatenate([(secret.descriptors == 0).sum(axis=1) for secret in secrets.values()]) - dim
         parts = [(beyond >= low) & (beyond <= high) for low, high in ZEROS.values()]
         zeros.append(markdown_row((dim, *(format_fraction(hit, part) for part in parts))))
-        print(shares[-1], zeros[-1], sep="\n", flush=True)
+        print(fractions[-1], zeros[-1], sep="\n", flush=True)
     return "\n".join(
         [
-            "## Found exactly",
+            "## Descriptors found exactly",
             "",
-            f"Share of descriptors that are found to {EXACT:g} by `sparsity` and `lattice`, which know nothing. *Raw rows*: the",
-            f"database is not the shipped one, whose words are centres of clusters, but {RAW_ROWS:,} descriptors as they are.",
-            "*Candidates*: `lattice` has the descriptor among the points that it finds, whether or not it takes it.",
+            f"Fraction of descriptors that `sparsity` and `lattice` find to within {EXACT:g}. Both use the release alone.",
+            f"The shipped database holds centres of clusters; that of the columns *raw rows* holds {RAW_ROWS:,} descriptors.",
+            "*candidates*: the descriptor is among the points that `lattice` finds, whether or not it is the estimate.",
             "",
-            *shares,
+            *fractions,
             "",
-            "`sparsity`, shipped database, by how many more zeros the descriptor has than the subspace dimensions: found so",
-            "often, of so many. Without any it is no degenerate vertex, and cannot be found.",
+            "`sparsity`, shipped database, by the number of the descriptor's zeros minus the dimension of the subspace. Entries:",
+            "the fraction found of these descriptors, and their fraction of all. Without such zeros a descriptor is no",
+            "degenerate vertex, and the attack cannot find it.",
             "",
             *zeros,
             "",
@@ -179,17 +187,18 @@ def write_exact(raw: Asset) -> str:
     )
 
 
-def find_exact(dim: int, secret: Features, raw: Asset) -> Iterator[np.ndarray]:
-    """Yield which descriptors are found, in the order of COLUMNS. -> (N,) bool each"""
+def find_exact(dim: int, secret: Features, raw: Asset) -> dict[str, np.ndarray]:
+    """Return which descriptors are found, by COLUMNS. -> (N,) bool each"""
+    hits = []
     for database, parts in ((Asset("shipped"), 16), (raw, 1)):
         view = create_view(Affine(dim=dim, database=database, sub_databases=parts), secret)
         for attack in (Sparsity(), Lattice()):
             estimates = attack.recover(view, np.random.default_rng(0))
-            yield np.linalg.norm(estimates - secret.descriptors, axis=1) < EXACT
+            hits.append(np.linalg.norm(estimates - secret.descriptors, axis=1) < EXACT)
     assert isinstance(view.release, Subspaces)
     owners, points = find_unit_integer_points(view.release, Lattice.longest)
-    hit = np.linalg.norm(points - secret.descriptors[owners], axis=1) < EXACT
-    yield np.isin(np.arange(len(secret)), owners[hit])
+    exact = np.linalg.norm(points - secret.descriptors[owners], axis=1) < EXACT
+    return dict(zip(COLUMNS, [*hits, np.isin(np.arange(len(secret)), owners[exact])], strict=True))
 
 
 def format_fraction(hits: np.ndarray, subset: np.ndarray) -> str:
@@ -197,9 +206,9 @@ def format_fraction(hits: np.ndarray, subset: np.ndarray) -> str:
     return f"{hits[subset].mean():.3f} of {subset.mean():.0%}" if subset.any() else "none"
 
 
-def extract_all() -> Iterator[Features]:
-    for source in photographs.list_builtin():
-        yield Sift().extract(photographs.read(source.path).pixels, source.path)
+def extract_all() -> dict[Source, Features]:
+    """Extract the features of the built-in photographs."""
+    return {source: Sift().extract(photographs.read(source.path).pixels, source.path) for source in photographs.list_builtin()}
 
 
 # ---- speed
@@ -208,39 +217,46 @@ def extract_all() -> Iterator[Features]:
 def write_speed() -> str:
     """Write the processor time of `recover` alone, on whole photographs; other releases are drawn beforehand."""
     lines = [
-        "## Milliseconds a descriptor",
+        "## Milliseconds per descriptor",
         "",
-        f"Processor time of the attack alone, by the photograph's keypoints; mean over the first {TIMED_ON} photographs. Not",
-        "counted: what is computed once, such as other users' releases; and image reconstruction, except for `dia`.",
+        f"Processor time of the attack divided by the number of keypoints: mean over the first {TIMED_ON} photographs. Image",
+        "reconstruction is not included, except for `dia`; nor is work that is done once, such as other users' releases.",
         "",
         markdown_row(("attack", *(f"dim {dim}" for dim in DIMS))),
         markdown_row(["---"] * (1 + len(DIMS))),
     ]
-    features = list(zip(photographs.list_builtin(), extract_all(), strict=True))[:TIMED_ON]
+    timed = list(extract_all().items())[:TIMED_ON]
     spent: dict[str, list[list[float]]] = {name: [[] for _ in DIMS] for name in TIMED}
-    with Progress("speed", len(TIMED) * len(DIMS) * len(features)) as progress:
+    with Progress("speed", len(TIMED) * len(DIMS) * len(timed)) as progress:
         for column, dim in enumerate(DIMS):
             defense = Affine(dim=dim)
-            pool = release_others(defense)
-            for source, secret in features:
-                view = create_view(defense, secret, pool, source.name)
+            pool = functools.cache(functools.partial(release_others, defense))
+            for source, secret in timed:
                 for name in TIMED:
-                    spent[name][column].append(1e3 * measure_seconds(spec.read(name, discovery.ATTACK), view) / len(secret))
+                    attack = spec.read(name, discovery.ATTACK)
+                    inputs = [spec.to_json_with_digests(plugin, PUBLIC) for plugin in (defense, attack)]
+                    if isinstance(attack, ImageAttack):
+                        inputs.append(dict(attack.assets(defense, Sift(), PUBLIC)))
+                    compute = functools.partial(measure_seconds, attack, defense, secret, pool, source.name)
+                    seconds = cache_arrays("measure_attacks", [source.content_hash(), *inputs], compute)["seconds"]
+                    spent[name][column].append(1e3 * float(seconds[0]) / len(secret))
                     progress.advance(note=f"{name}, dim {dim}")
     lines += [markdown_row((f"`{name}`", *(f"{np.mean(values):.2f}" for values in spent[name]))) for name in TIMED]
     return "\n".join([*lines, ""])
 
 
-def measure_seconds(attack: Attack, view: View) -> float:
-    """Return the processor time for one photograph in seconds."""
-    view = replace(view, notes=[])
+def measure_seconds(
+    attack: Attack, defense: Affine, secret: Features, pool: Callable[[], ReleasePool], photograph: str
+) -> dict[str, np.ndarray]:
+    """Return the processor time for one photograph: `seconds`."""
+    view = create_view(defense, secret, pool(), photograph)
     rng = np.random.default_rng(0)
     started = time.process_time()
     if isinstance(attack, DescriptorAttack):
         attack.recover(view, rng)
     elif isinstance(attack, ImageAttack):
         attack.reconstruct(view, rng)
-    return time.process_time() - started
+    return {"seconds": np.array([time.process_time() - started])}
 
 
 # ---- views

@@ -5,11 +5,11 @@
 2. Input encoding: the release as it is (the paper's stacking), or without its random order and basis; affine subspaces and word
    sets. From the network of 1. for upright descriptors with positions alone.
 
-    python tools/measure_encodings.py --data ../shared/data --work work/leakage
+    python tools/measure_encodings.py --data ../shared/data --work work/encodings
 
 All are trained on the third of the photographs of `train/` that the shipped dictionary was not built from (`make_assets.py`), and
 evaluated on those of `test.txt` and on the built-in ones. Finished trainings and measurements are reused. Writes
-docs/leakage.md.
+docs/results/input-encodings.md.
 """
 
 from __future__ import annotations
@@ -20,16 +20,17 @@ from pathlib import Path
 
 import numpy as np
 from make_assets import run_command, split_photographs
+from result_page import format_interval, write_page
 
 import bench
 from attacks.dia import DIA
 from bench.core.table import markdown_row
 from bench.registry import discovery, spec
+from bench.runner.records import Record
 from bench.settings import Asset
 from leaderboard.intervals import Interval, interval
 
-PAGE = Path(__file__).parents[1] / "docs" / "leakage.md"
-WIDTHS = "32,64,112,112"  # half of the shipped networks': a quarter of the time, for nine trainings
+WIDTHS = "32,64,112,112"  # of the shipped networks
 STEPS, FURTHER = 400, 300
 SENT = ("positions", "scale", "scale-and-orientation")
 SUBSPACES = tuple(f"affine:dim={dim}" for dim in (2, 4, 8, 16))
@@ -47,7 +48,7 @@ def main() -> None:
     args = parser.parse_args()
     study = Study(args.data, args.work)
     text = "\n".join([write_heading(study), compare_attributes(study), compare_encodings(study)])
-    PAGE.write_text(text, encoding="utf-8")
+    write_page("input-encodings.md", text, study.records)
 
 
 class Study:
@@ -60,6 +61,7 @@ class Study:
         tests = [data / "train" / name for name in (data / "test.txt").read_text().split()]
         self.photographs: dict[str, list[Path] | None] = {"test": tests, "built-in": None}
         self.trained_on = len(list(folders["2"].iterdir()))
+        self.records: list[Record] = []  # of all reconstructions
 
     def train_network(self, name: str, *words: object) -> Path:
         """Train a network by these arguments of `bench train`, unless it exists."""
@@ -80,6 +82,7 @@ class Study:
                 extractor=spec.read(extractor, discovery.EXTRACTOR),
                 out=self.work / "records",
             )
+            self.records += records
             for index, scores in enumerate(results):
                 own = records[index :: len(defenses)]  # all defenses of a photograph come before the next one
                 scores[where] = {metric: np.array([record["metrics"][metric] for record in own]) for metric in ("ssim", "psnr")}
@@ -89,12 +92,11 @@ class Study:
 def write_heading(study: Study) -> str:
     return (
         "# Effect of released attributes and of the input encoding\n\n"
-        "Written by `tools/measure_encodings.py`. "
-        f"All networks have half the channels of the shipped ones ({WIDTHS}) and are trained on "
-        f"the same {study.trained_on} photographs, in batches of 8 crops. **That is a small budget**: compare networks that "
-        "were trained equally long, and do not rely on their absolute quality; a difference may grow or vanish with "
-        "longer training. In brackets: 95% bootstrap over photographs, the 100 of `test.txt` and the 7 built-in ones, which no "
-        "network was trained or chosen on. Differences are of the same photographs; a network is *better* if the interval "
+        f"All networks have the channels of the shipped ones ({WIDTHS}). They are trained on the same {study.trained_on} "
+        "photographs, in batches of 8 samples. **That is a small budget**: compare networks that were trained equally long, "
+        "and do not rely on their absolute quality. A difference may grow or vanish with longer training. In brackets: 95% "
+        "intervals, by bootstrap over photographs, the 100 of `test.txt` and the 7 built-in ones, which no "
+        "network was trained or chosen on. Differences are paired by photograph; a network is *better* if the interval "
         "on `test.txt` lies above 0. Each was trained once; intervals do not include the variation between seeds. Additional "
         "input does not reduce leakage: a network with more input and a worse result has not learned to use it.\n"
     )
@@ -118,7 +120,7 @@ def compare_attributes(study: Study) -> str:
         [
             "## Released attributes of a keypoint",
             "",
-            f"Raw descriptors; each network trained from random weights for {STEPS} steps, all alike.",
+            f"Raw descriptors; each network was trained from random weights for {STEPS} steps.",
             "",
             *write_table(("SIFT", "released"), results),
             "",
@@ -148,9 +150,9 @@ def compare_encodings(study: Study) -> str:
             "## Input encoding",
             "",
             "Each network started from the one above for upright SIFT with positions alone, and was trained for "
-            f"{FURTHER} further steps, all alike; one for all settings of a defense. `released`: the random origin and basis, or "
-            "the words in order, stacked (the paper's). `invariant`: projections of fixed directions onto the subspace, or each "
-            "word embedded alike and summed.",
+            f"{FURTHER} further steps; one for all settings of a defense. `released`: the random origin and basis, or the words "
+            "in order, stacked (the paper's). `invariant`: projections of fixed directions onto the subspace, or each "
+            "word through the same embedding, summed.",
             "",
             *write_table(("defense", "encoding"), results),
             "",
@@ -174,7 +176,7 @@ def compare_pairs(
     results: Mapping[tuple[str, str], Scores], pairs: Sequence[tuple[tuple[str, str], tuple[str, str]]]
 ) -> list[str]:
     """Write paired differences in SSIM, and their verdicts."""
-    lines = [markdown_row(("SSIM of", "less that of", "test", "built-in", "result")), markdown_row(["---"] * 5)]
+    lines = [markdown_row(("SSIM of", "minus that of", "test", "built-in", "result")), markdown_row(["---"] * 5)]
     for one, other in pairs:
         a, b = results[one], results[other]
         gains = {where: interval(a[where]["ssim"] - b[where]["ssim"]) for where in ("test", "built-in")}
@@ -187,10 +189,6 @@ def compare_pairs(
 def describe_verdict(gain: Interval) -> str:
     """Describe the first of two networks relative to the second."""
     return "better" if gain.low > 0 else "worse" if gain.high < 0 else "inconclusive"
-
-
-def format_interval(value: Interval, digits: int, sign: str = "") -> str:
-    return f"{value.mean:{sign}.{digits}f} [{value.low:{sign}.{digits}f}, {value.high:{sign}.{digits}f}]"
 
 
 if __name__ == "__main__":

@@ -1,11 +1,11 @@
 """Compares ideas for the inversion network in short trainings of equal processor time, and ranks them on `tune.txt`.
 
-    python tools/training_ideas.py --data ../shared/data --work work/ideas [--idea NAME ...] [--seconds 600]
-        [--initial-checkpoint FILE]
+    python tools/training_ideas.py --data ../shared/data [--idea NAME ...] [--seconds 240] [--initial-checkpoint FILE]
 
 IDEAS lists how each idea differs from `bench train`. All train on raw descriptors of the photographs of `train/` that are in
-neither list, from random weights or from a trained network, and are scored on the 100 of `tune.txt`. Results are appended to
-docs/ideas.jsonl, one line per training, from which the page docs/ideas.md is written.
+neither list, from random weights or from a trained network, and are scored on the 100 of `tune.txt`. Each training appends a line
+to docs/results/training-ideas.jsonl, from which docs/results/training-ideas.md is written. Without --idea, the ideas that the log
+lacks for this time and checkpoint are trained, so an interrupted run resumes.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ import torch
 import torch.nn.functional as nnf
 from make_assets import split_photographs
 from perceptual_loss import extract_classifier, extract_vgg, measure_dissimilarity, vgg_file
+from result_page import RESULTS, write_page
 from torch import Tensor, nn
 
 from bench.codebook.public import Public
@@ -49,14 +50,13 @@ from bench.inversion.train import build_batch, score, validate
 from bench.types import Descriptors, Points
 from defenses.none import Undefended
 
-DOCS = Path(__file__).parents[1] / "docs"
-LOG, PAGE = DOCS / "ideas.jsonl", DOCS / "ideas.md"
-SIZES = ("crops", "parameters", "photographs", "date")
+LOG = RESULTS / "training-ideas.jsonl"
+SIZES = ("samples", "parameters", "photographs", "date")
 WARMUP = 50  # steps; fewer than in `bench train`, since these trainings are short
 UNCHANGED = "as bench train"
 PAPER = {"ssim": (0.6878, 3), "psnr": (18.59, 2)}  # the row of raw descriptors, and digits
-VGG = "loss: what VGG sees"
-UNTURNED = "not turned"  # but mirrored, as half of the views are
+VGG = "loss: VGG features"
+UNTURNED = "not rotated"  # but mirrored, as half of the views are
 INPUTS = 128 + 2  # a raw descriptor, and the position within a cell
 
 
@@ -250,20 +250,20 @@ IDEAS = {
     "loss: gradients": Idea(loss_weights={"gradient": 0.5}),
     "loss: more ssim": Idea(loss_weights={"dissimilarity": 0.6}),
     "loss: psnr for l1": Idea(loss_weights={"l1": 0.0, "psnr": 0.05}),
-    "loss: what a classifier sees": Idea(loss_weights={"classifier": 0.1}),
+    "loss: classifier features": Idea(loss_weights={"classifier": 0.1}),
     VGG: Idea(loss_weights={"vgg": 0.1}),
-    "rate that falls in a line": Idea(schedule=create_linear_decay(1.0)),
-    "rate that falls at the end": Idea(schedule=create_linear_decay(0.3)),
+    "linear decay of the rate": Idea(schedule=create_linear_decay(1.0)),
+    "linear decay in the last 30%": Idea(schedule=create_linear_decay(0.3)),
     "rate 8e-3": Idea(training={"rate": 8e-3}),
     "rate 2e-3": Idea(training={"rate": 2e-3}),
     "batches of 4": Idea(training={"batch": 4}),
     "batches of 16": Idea(training={"batch": 16}),
-    "short average": Idea(training={"average": 0.99}),
+    "shorter average of the weights": Idea(training={"average": 0.99}),
     "half the channels": Idea(shape={"widths": (16, 32, 56, 56)}),
-    "half as many channels again": Idea(shape={"widths": (48, 96, 168, 168)}),
+    "1.5 times the channels": Idea(shape={"widths": (48, 96, 168, 168)}),
     "twice the channels, 320 hidden": Idea(shape={"widths": (64, 128, 224, 224), "hidden": 320}),
     "twice the channels at the bottom": Idea(shape={"widths": (32, 64, 128, 224)}),
-    "a level more": Idea(shape={"widths": (32, 64, 112, 112, 112)}),
+    "one more level": Idea(shape={"widths": (32, 64, 112, 112, 112)}),
     "192 hidden": Idea(shape={"hidden": 192}),
     "320 hidden": Idea(shape={"hidden": 320}),
     "512 hidden": Idea(shape={"hidden": 512}),
@@ -288,21 +288,26 @@ IDEAS = {
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, required=True, help="the folder of tune.txt and train/")
-    parser.add_argument("--work", type=Path, required=True, help="folder of features, reused between runs")
-    parser.add_argument("--idea", choices=IDEAS, action="append", help="idea to test, may be repeated; default: all available")
-    parser.add_argument("--seconds", type=float, default=600, help="processor time per idea, over all threads")
+    parser.add_argument("--data", type=Path, help="the folder of tune.txt and train/; without it, only the page is written")
+    parser.add_argument("--work", type=Path, default=Path("work/ideas"), help="folder of features, reused (default: %(default)s)")
+    parser.add_argument("--idea", choices=IDEAS, action="append", help="train this idea, also if the log has it; may be repeated")
+    parser.add_argument("--seconds", type=float, default=240, help="processor time per idea, over all threads")
     parser.add_argument("--initial-checkpoint", type=Path, help="a network for raw descriptors, instead of random weights")
     args = parser.parse_args()
-    for name in args.idea or [name for name in IDEAS if name != VGG or vgg_file().is_file()]:
+    records = [json.loads(line) for line in LOG.read_text(encoding="utf-8").splitlines()]
+    initial = args.initial_checkpoint and args.initial_checkpoint.stem
+    logged = {(record["idea"], record["seconds"], record.get("initial_checkpoint")) for record in records}
+    available = [name for name in IDEAS if name != VGG or vgg_file().is_file()]
+    names = args.idea or [name for name in available if (name, args.seconds, initial) not in logged]
+    for name in names if args.data else ():
         try:
-            record = {"idea": name, "date": time.strftime("%Y-%m-%d"), **try_idea(IDEAS[name], args)}
+            records.append({"idea": name, "date": time.strftime("%Y-%m-%d"), **try_idea(IDEAS[name], args)})
         except UserError as error:
             parser.error(str(error))
-        print(record, flush=True)
+        print(records[-1], flush=True)
         with LOG.open("a", encoding="utf-8") as log:
-            log.write(json.dumps(record) + "\n")
-        PAGE.write_text(write_page([json.loads(line) for line in LOG.read_text(encoding="utf-8").splitlines()]), encoding="utf-8")
+            log.write(json.dumps(records[-1]) + "\n")
+    write_page("training-ideas.md", format_page(records), records)
 
 
 def try_idea(idea: Idea, args: argparse.Namespace) -> dict[str, Any]:
@@ -313,12 +318,14 @@ def try_idea(idea: Idea, args: argparse.Namespace) -> dict[str, Any]:
     examples = Examples(photographs[: 4 * idea.photographs], Undefended(), {}, {}, Public(), under)
     unseen = Examples(tune, Undefended(), {}, {}, Public())
     torch.manual_seed(0)
-    network, training = idea.build_network(), {"warmup": WARMUP, **idea.training}
+    network, training, initial = idea.build_network(), {"warmup": WARMUP, **idea.training}, {}
     if args.initial_checkpoint:
-        network.load_state_dict(weights.load(args.initial_checkpoint).module.state_dict())
+        checkpoint = weights.load(args.initial_checkpoint)
+        network.load_state_dict(checkpoint.module.state_dict())
         training = {"rate": 1e-3, **training}  # as in the second stage of tools/make_assets.py
+        initial = {"initial_checkpoint": args.initial_checkpoint.stem, "initial_digest": checkpoint.digest}
     learner = Learner(network, Training(**training), idea.compute_loss)
-    crops = fit(learner, examples, idea, args.seconds)
+    samples = fit(learner, examples, idea, args.seconds)
     network = learner.load_average()
     scores = validate(network, unseen, tune[::4], 1, "invariant")
     averaged = score_average(network, symmetries, tune[::4])
@@ -326,12 +333,12 @@ def try_idea(idea: Idea, args: argparse.Namespace) -> dict[str, Any]:
     return {
         "upright": idea.upright,
         "seconds": args.seconds,
-        "start": args.initial_checkpoint and args.initial_checkpoint.stem,
-        "trained_on": idea.photographs,
-        "crops": crops,
+        **initial,
+        "photographs": idea.photographs,
+        "samples": samples,
         "parameters": parameters,
         **{metric: scores[metric] for metric in ("mae", "ssim", "psnr")},
-        "shown": averaged,
+        "averaged": averaged,
     }
 
 
@@ -372,71 +379,75 @@ def load_views(args: argparse.Namespace, which: str, upright: bool) -> list[Phot
     return views
 
 
-def write_page(records: Sequence[dict[str, Any]]) -> str:
-    """Write docs/ideas.md: trainings grouped by their time, the best first."""
+def format_page(records: Sequence[dict[str, Any]]) -> str:
+    """Return the page: trainings grouped by their time, the best first."""
     lines = [
         "# Ideas for the inversion network",
         "",
-        "Written by `tools/training_ideas.py`, which says what each idea is. Raw descriptors; "
-        "trainings in equal processor time, from random weights unless an initial checkpoint is named; "
-        "scores on the 100 photographs of `tune.txt` (SSIM where its window fits). "
-        "Short trainings favour fast learners, and each was done once: ignore small differences. *Shown*: the mean over "
-        "reconstructions from the releases of the mirrored and rotated photograph, with their number. *Earlier*: another "
-        "layout or optimizer, which is in the history of this repository, except for Muon without two layers, which the name "
-        "describes. Trainings of more than 10 minutes are `bench train`'s, with their minutes as wall time of its threads; "
-        "the shipped networks were trained in stages, each from the result of the one before.",
+        "`tools/training_ideas.py` defines each idea. [The log](training-ideas.jsonl) has one line for each training, which "
+        "`--data DATA --idea NAME --seconds SECONDS --initial-checkpoint FILE` appends.",
+        "",
+        "The networks invert raw descriptors. Trainings in one table had equal processor time. They started from random weights, "
+        "unless the table names an initial checkpoint. Scores are of the 100 photographs of `tune.txt` (SSIM where its window "
+        "fits). Short trainings favour fast learners, and each was run once: ignore small differences.",
+        "",
+        "- *averaged*: scores of the mean over reconstructions from mirrored and rotated releases, with their number.",
+        "- *earlier*: another layout or optimizer, from the history of this repository. Muon without two layers is described by "
+        "its name.",
+        "- Trainings of more than 10 minutes are by `bench train`, with the wall time of its threads. The shipped networks were "
+        "trained in stages, each from the result of the previous one.",
     ]
     for group in sorted({describe_group(record) for record in records}):
-        oriented, seconds, start = group
+        oriented, seconds, initial = group
         members = [record for record in records if describe_group(record) == group]
-        kind, origin = "Oriented" if oriented else "Upright", f", from `{start}`" if start else ""
+        kind, origin = "Oriented" if oriented else "Upright", f", from `{initial}`" if initial else ""
         lines += ["", f"## {kind} SIFT, {seconds / 60:g} minutes of one core{origin}", ""]
-        lines += [markdown_row(("idea", "MAE", "SSIM, PSNR", "shown", *SIZES))]
-        lines += [markdown_row(["---"] * 8)]
+        lines += [markdown_row(("idea", "MAE", "SSIM, PSNR", "averaged", *SIZES)), markdown_row(["---"] * 8)]
         for record in sorted(members, key=lambda record: -record["ssim"]):
-            averaged = record["shown"]
+            averaged = record["averaged"]
             scores = [f"{record['mae']:.4f}", f"{record['ssim']:.4f}, {record['psnr']:.2f}"]
             scores += [f"{averaged['ssim']:.4f}, {averaged['psnr']:.2f} ({averaged['times']})"]
-            sizes = f"{record['crops']:,}", f"{record['parameters'] / 1e6:.1f} M"
-            lines.append(markdown_row((record["idea"], *scores, *sizes, record["trained_on"], record["date"])))
-    alone = [record for record in records if record["upright"] and not record.get("start")]
-    lines += ["", "## How the gap closes", "", "One reconstruction; upright, from random weights, unless stated otherwise."]
+            sizes = f"{record['samples']:,}", f"{record['parameters'] / 1e6:.1f} M"
+            lines.append(markdown_row((record["idea"], *scores, *sizes, record["photographs"], record["date"])))
+    alone = [record for record in records if record["upright"] and not record.get("initial_checkpoint")]
+    lines += ["", "## Extrapolation to the paper's scores", ""]
+    lines += ["One reconstruction; upright, from random weights, unless stated otherwise."]
     for idea in (UNCHANGED, UNTURNED):
         whole = [record for record in alone if record["idea"] == idea]
         fewer = [record for record in alone if record["idea"] in (f"{idea}; 200 photographs", f"{idea}; 400 photographs")]
         longest = max((record["seconds"] for record in fewer), default=0)
         same = [record for record in whole if record["seconds"] == longest]
-        lines += extrapolate(f"{idea.capitalize()}, by training samples", whole, "crops")
-        lines += extrapolate(f"{idea.capitalize()}, by photographs, in {longest / 60:g} minutes", fewer + same, "trained_on")
+        lines += extrapolate(f"{idea.capitalize()}, by training samples", whole, "samples")
+        lines += extrapolate(f"{idea.capitalize()}, by photographs, in {longest / 60:g} minutes", fewer + same, "photographs")
     for upright, first in ((True, UNTURNED), (False, f"{UNTURNED}; oriented")):
         same = [record for record in records if record["upright"] == upright]
-        stages = [record for record in same if record["idea"] == first and not record.get("start")]
+        stages = [record for record in same if record["idea"] == first and not record.get("initial_checkpoint")]
         # `before`: training samples of the initial checkpoint, in rows of `bench train`, which are added by hand.
-        stages += [record | {"crops": record["before"] + record["crops"]} for record in same if "before" in record]
+        stages += [record | {"samples": record["before"] + record["samples"]} for record in same if "before" in record]
         kind = "upright" if upright else "oriented"
-        lines += extrapolate(f"By training stages, {kind}, the first not turned, by training samples in all", stages, "crops")
-    return "\n".join(lines) + "\n"
+        lines += extrapolate(f"By samples of all stages, {kind}, the first stage without rotations", stages, "samples")
+    return "\n".join(lines)
 
 
 def describe_group(record: dict[str, Any]) -> tuple[bool, float, str]:
     """Return the common settings of trainings that are compared."""
-    return not record["upright"], record["seconds"], record.get("start") or ""
+    return not record["upright"], record["seconds"], record.get("initial_checkpoint") or ""
 
 
 def extrapolate(title: str, trained: Sequence[dict[str, Any]], by: str) -> list[str]:
-    """Write how scores grow with the key `by`, and its extrapolated value for the scores of the paper."""
-    ordered, name = sorted(trained, key=lambda one: one[by]), "photographs" if by == "trained_on" else by
+    """Return how scores grow with the key `by`, and its extrapolated value for the scores of the paper."""
+    ordered = sorted(trained, key=lambda one: one[by])
     if not ordered or ordered[-1][by] < 2 * ordered[0][by]:  # too close for a fit
         return []
-    table = [markdown_row((name, "SSIM", "PSNR")), markdown_row(["---"] * 3)]
+    table = [markdown_row((by, "SSIM", "PSNR")), markdown_row(["---"] * 3)]
     table += [markdown_row((f"{one[by]:,}", f"{one['ssim']:.4f}", f"{one['psnr']:.2f}")) for one in ordered]
     logs = np.log2([one[by] for one in ordered])
     statements = []
     for metric, (paper, digits) in PAPER.items():
         slope, offset = np.polyfit(logs, [one[metric] for one in ordered], 1)
         grown = f"{metric.upper()} grows by {slope:.{digits}f} for each doubling"
-        statements.append(f"{grown}, and would be the paper's {paper} after {2 ** ((paper - offset) / slope):.1e} {name}")
-    line = f"By a line through these {len(ordered)}, {'; '.join(statements)}. That is an extrapolation, and no measurement."
+        statements.append(f"{grown} and reaches the paper's {paper} after {2 ** ((paper - offset) / slope):.1e} {by}")
+    line = f"On a line through these {len(ordered)} points, {'; '.join(statements)}. This is an extrapolation, not a measurement."
     return ["", f"{title}:", "", *table, "", line]
 
 

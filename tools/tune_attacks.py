@@ -1,11 +1,13 @@
-"""Chooses the settings of attacks on the photographs of `tune.txt`, on which nothing is reported, and writes docs/tuning.md.
+"""Chooses the settings of attacks and of the task `collisions` on the photographs of `tune.txt`; writes docs/results/tuning.md.
 
-    python tools/tune_attacks.py --data ../shared/data [--attack database]
+    python tools/tune_attacks.py --data ../shared/data
+
+Nothing is reported on these photographs. Results of each photograph are cached, so an interrupted run resumes.
 
 Every setting of an attack's grid recovers the descriptors of the same releases: at each setting of the defense, some keypoints of
 each photograph, or all of a few for attacks that use other releases. The chosen setting has the smallest angle to the true
-descriptors, averaged over the settings of the defense. The tables also show the gain of the best setting at each of them and, for
-attacks that use other releases, the coverage that the attack estimates. To tune another attack, add it to TUNINGS.
+descriptors, averaged over the settings of the defense. The tables also show the best setting at each of them and, for attacks
+that use other releases, the coverage that the attack estimates. To tune another attack, add it to TUNINGS.
 """
 
 from __future__ import annotations
@@ -20,14 +22,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tune_collisions
+from result_page import cache_arrays, write_page
 
 from attacks.clustering import Clustering, build_candidates, select_candidates
 from attacks.database import Database
 from attacks.intersection import Intersection, estimate_descriptors
 from bench.api import DescriptorAttack, View, require_subspaces
 from bench.codebook.public import Public
+from bench.core import hashing
 from bench.core.errors import UserError
 from bench.core.progress import Progress
+from bench.core.table import markdown_row
 from bench.extractors.sift import Sift
 from bench.geometry.database_reconstruction import reconstruct_database
 from bench.geometry.estimates import estimate
@@ -36,21 +42,23 @@ from bench.geometry.shared_sub_database import SharedSubDatabase, find_shared_su
 from bench.geometry.subspaces import find_nearest_to_subspaces
 from bench.images import photographs
 from bench.images.photographs import Source
-from bench.registry import discovery, spec
+from bench.registry import spec
 from bench.runner.other_releases import ReleasePool
 from bench.tasks.reconstruction import offer_knowledge
 from bench.threat_model import DefenseDatabase, OtherReleases, PublicDatabase
 from bench.types import Floats
+from defenses.affine import Affine
 from metrics.angle import Angle
 from metrics.recovered import Recovered
 
-TABLE = Path(__file__).parents[1] / "docs" / "tuning.md"
-TITLE = """# How the attacks' settings were chosen
+TITLE = """# Settings of the attacks
 
-Written by `tools/tune_attacks.py`, on photographs that no result is reported on and that no dictionary was made from.
+The photographs are those of `tune.txt`, 100 of `train/`. No result is reported on them, and no dictionary is built from them.
+Features are upright SIFT.
 """
 METRICS = (Angle(), Recovered())
-POINTS = ("affine:dim=2", "affine:dim=4", "affine:dim=8", "affine:dim=16")
+DEFENSES = {f"affine:dim={dim}": Affine(dim=dim) for dim in (2, 4, 8, 16)}
+PUBLIC, EXTRACTOR = Public(), Sift()
 
 
 # The estimates of one setting, and the coverage that it had of the words in the release; NaN where it looks at no other release.
@@ -157,46 +165,56 @@ TUNINGS = (
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    names = [tuning.attack.name() for tuning in TUNINGS]
     parser.add_argument("--data", type=Path, required=True, help="the folder of tune.txt and train/")
-    parser.add_argument("--attack", choices=names, action="append", help="one to tune, may be repeated; all by default")
     args = parser.parse_args()
     sources = [Source(name, args.data / "train" / name) for name in (args.data / "tune.txt").read_text().split()]
-    for tuning in TUNINGS:
-        if tuning.attack.name() in (args.attack or names):
-            section = write_section(tuning, measure(tuning, sources))
-            print(section)
-            save_section(tuning.attack.name(), section)
+    sections = [write_section(tuning, measure(tuning, sources)) for tuning in TUNINGS]
+    plugins = [*DEFENSES.values(), *(tuning.attack() for tuning in TUNINGS)]
+    write_page(
+        "tuning.md",
+        "\n".join([TITLE, *sections, tune_collisions.tune(sources)]),
+        [spec.to_json_with_digests(plugin, PUBLIC) for plugin in plugins],
+    )
 
 
 def measure(tuning: Tuning, sources: Sequence[Source]) -> np.ndarray:
-    """Measure angle, fraction recovered, and coverage. -> (points, settings, photographs, 3)"""
-    public, extractor = Public(), Sift()
-    defenses = [spec.read(point, discovery.DEFENSE) for point in POINTS]
-    pools = [
-        ReleasePool(sources, extractor, defense, public, functools.partial(create_generator, point))
-        for point, defense in enumerate(defenses)
-    ]
-    settings = list(tuning.settings.values())
-    chosen_sources = sources[: tuning.photographs]
-    values = np.empty((len(defenses), len(settings), len(chosen_sources), len(METRICS) + 1))
-    with Progress(tuning.attack.name(), len(chosen_sources) * len(defenses)) as progress:
-        for number, source in enumerate(chosen_sources):
-            secret = extractor.extract(photographs.read(source.path).pixels, source.path)
-            rng = np.random.default_rng(number)
-            if tuning.keypoints is not None:
-                secret = secret.take(np.sort(rng.choice(len(secret), min(tuning.keypoints, len(secret)), replace=False)))
-            for point, defense in enumerate(defenses):
-                release = defense.protect(secret, public, np.random.default_rng([number, point]))
-                others = pools[point].without(source.name)
-                knowledge = offer_knowledge(settings[0], defense, public) | {
-                    OtherReleases: lambda others=others: OtherReleases(draw=others)
+    """Measure angle, fraction recovered, and coverage. -> (defenses, settings, photographs, 3)"""
+    values = np.empty((len(DEFENSES), len(tuning.settings), tuning.photographs, len(METRICS) + 1))
+    everyone = hashing.digest([source.content_hash() for source in sources])
+    with Progress(tuning.attack.name(), len(DEFENSES) * tuning.photographs) as progress:
+        for point, defense in enumerate(DEFENSES.values()):
+            pool = ReleasePool(sources, EXTRACTOR, defense, PUBLIC, functools.partial(create_generator, point))
+            for number in range(tuning.photographs):
+                inputs = {
+                    "attack": [spec.to_json_with_digests(tuning.attack(), PUBLIC), list(tuning.settings)],
+                    "defense": [spec.to_json_with_digests(defense, PUBLIC), point],
+                    "photograph": [everyone, number, tuning.keypoints],
                 }
-                view = View(release=release, defense=defense, extractor=extractor, knowledge=knowledge)
-                for setting, (estimates, coverage) in enumerate(tuning.recover(view, settings)):
-                    values[point, setting, number] = [*(metric(secret.descriptors, estimates) for metric in METRICS), coverage]
+                compute = functools.partial(measure_photograph, tuning, sources[number], number, defense, point, pool)
+                values[point, :, number] = cache_arrays("tune_attacks", inputs, compute)["values"]
                 progress.advance()
     return values
+
+
+def measure_photograph(
+    tuning: Tuning, source: Source, number: int, defense: Affine, point: int, pool: ReleasePool
+) -> dict[str, np.ndarray]:
+    """Measure all settings on one release. -> `values`, (settings, 3)"""
+    secret = EXTRACTOR.extract(photographs.read(source.path).pixels, source.path)
+    if tuning.keypoints is not None:
+        count = min(tuning.keypoints, len(secret))
+        secret = secret.take(np.sort(np.random.default_rng(number).choice(len(secret), count, replace=False)))
+    release = defense.protect(secret, PUBLIC, np.random.default_rng([number, point]))
+    settings = list(tuning.settings.values())
+    knowledge = offer_knowledge(settings[0], defense, PUBLIC) | {
+        OtherReleases: lambda: OtherReleases(draw=pool.without(source.name))
+    }
+    view = View(release=release, defense=defense, extractor=EXTRACTOR, knowledge=knowledge)
+    values = [
+        [*(metric(secret.descriptors, estimates) for metric in METRICS), coverage]
+        for estimates, coverage in tuning.recover(view, settings)
+    ]
+    return {"values": np.array(values, dtype=np.float64)}
 
 
 def create_generator(point: int, *parts: object) -> np.random.Generator:
@@ -205,58 +223,41 @@ def create_generator(point: int, *parts: object) -> np.random.Generator:
 
 
 def write_section(tuning: Tuning, measured: np.ndarray) -> str:
-    """Write a section of docs/tuning.md. (points, settings, photographs, 3)"""
-    angles = measured[..., 0].mean(axis=2)  # (points, settings)
+    """Write a section of the page. (defenses, settings, photographs, 3)"""
+    angles = measured[..., 0].mean(axis=2)  # (defenses, settings)
     settings = list(tuning.settings)
     best = int(angles.mean(axis=0).argmin())
     keypoints = "all keypoints" if tuning.keypoints is None else f"{tuning.keypoints} keypoints"
-    covered = "" if np.isnan(measured[..., 2]).all() else ", and the coverage of the adversarial words by the attack's own count"
+    covered = "" if np.isnan(measured[..., 2]).all() else ", and the coverage of the adversarial words that the attack estimates"
     lines = [
-        f"`python tools/tune_attacks.py --data DATA --attack {tuning.attack.name()}`: {measured.shape[2]} photographs, "
-        f"{keypoints} of each, upright SIFT.",
+        f"## {tuning.attack.name()}",
         "",
-        f"Chosen, by the mean over the points: `{settings[best]}`. Cells: mean angle in degrees, the share recovered among "
-        f"these keypoints{covered}. What is lost: degrees, with the standard error over photographs.",
+        f"{measured.shape[2]} photographs, {keypoints} of each. Chosen by the mean angle over the defenses: `{settings[best]}`.",
         "",
-        "| point | chosen | best there | which is | lost |",
-        "| --- | --- | --- | --- | --- |",
+        f"Entries: mean angle in degrees, fraction recovered among these keypoints{covered}. Loss: difference of the angles in "
+        "degrees, with its standard error over photographs.",
+        "",
+        markdown_row(("defense", "chosen setting", "best setting", "name of the best", "loss")),
+        markdown_row(["---"] * 5),
     ]
-    for point, values in zip(POINTS, measured, strict=True):
-        there = int(values[..., 0].mean(axis=1).argmin())
-        lost = values[best, :, 0] - values[there, :, 0]  # (photographs,)
-        error = lost.std(ddof=1) / len(lost) ** 0.5
-        lines.append(
-            format_row(
-                f"`{point}`",
-                format_cell(values[best]),
-                format_cell(values[there]),
-                settings[there],
-                f"{lost.mean():.2f} ± {error:.2f}",
-            )
-        )
-    lines += ["", format_row("setting", *(f"`{point}`" for point in POINTS), "mean angle")]
-    lines.append(format_row(*["---"] * (len(POINTS) + 2)))
+    for defense, values in zip(DEFENSES, measured, strict=True):
+        own = int(values[..., 0].mean(axis=1).argmin())
+        loss = values[best, :, 0] - values[own, :, 0]  # (photographs,)
+        error = loss.std(ddof=1) / len(loss) ** 0.5
+        entries = format_entry(values[best]), format_entry(values[own]), settings[own], f"{loss.mean():.2f} ± {error:.2f}"
+        lines.append(markdown_row((f"`{defense}`", *entries)))
+    lines += ["", markdown_row(("setting", *(f"`{defense}`" for defense in DEFENSES), "mean angle"))]
+    lines.append(markdown_row(["---"] * (len(DEFENSES) + 2)))
     for number, name in enumerate(settings):
-        lines.append(format_row(name, *(format_cell(values[number]) for values in measured), f"{angles[:, number].mean():.2f}"))
-    return "\n".join(lines) + "\n"
+        own_entries = (format_entry(values[number]) for values in measured)
+        lines.append(markdown_row((name, *own_entries, f"{angles[:, number].mean():.2f}")))
+    return "\n".join([*lines, ""])
 
 
-def format_cell(values: np.ndarray) -> str:
+def format_entry(values: np.ndarray) -> str:
     """Format the means of (photographs, 3)."""
     angle, fraction, coverage = values.mean(axis=0)
     return f"{angle:.2f}° {fraction:.3f}" + ("" if np.isnan(coverage) else f", {coverage:.2f}")
-
-
-def format_row(*cells: str) -> str:
-    return f"| {' | '.join(cells)} |"
-
-
-def save_section(name: str, section: str) -> None:
-    """Replace the section of the attack, or append it."""
-    parts = TABLE.read_text(encoding="utf-8").split("\n## ") if TABLE.is_file() else [TITLE]
-    sections = dict(part.split("\n", 1) for part in parts[1:]) | {name: "\n" + section}
-    text = "".join(f"\n## {title}\n{body.rstrip()}\n" for title, body in sections.items())
-    TABLE.write_text(TITLE + text, encoding="utf-8")
 
 
 if __name__ == "__main__":

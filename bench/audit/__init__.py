@@ -1,1 +1,1 @@
-"""Audits of a defense's ε, by trials and by enumeration."""
+"""Audit of a defense's ε, by trials and by enumeration."""

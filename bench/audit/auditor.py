@@ -1,23 +1,23 @@
-"""Audits a defense's ε: computes lower bounds from releases of `protect`, and searches for violations of ε-LDP.
+"""Audit of a defense's ε: lower bounds from releases of `protect`, and a search for violations of ε-LDP.
 
 For any event E and any two descriptors, an ε-LDP release has Pr(E | d1) ≤ e^ε Pr(E | d2). Two descriptors are released many
-times. One half of the calls selects the most informative event of each family; the other half measures its two rates. `protect`,
-including the quantiser, is a black box.
+times. One half of the calls selects the most informative event of each family. The other half measures the two rates of that
+event. `protect`, including the quantiser, is a black box. The families of events are:
 
-- membership: one word is released, and another is not
-- position: one word has one position in its row, and another is not released
-- projection: the release lies far in the direction from d2 to d1 (where descriptors are released)
-- keypoints: the answers to two keypoints of one call share at least a number of words
-- calls: the answers to one keypoint in two calls share at least a number of words
+- membership: one word is released, and another is not.
+- position: one word is at a certain position in its row, and another is not released.
+- projection: the release is far in the direction from d2 to d1 (if descriptors are released).
+- keypoints: the answers to two keypoints of one call have at least a certain number of words in common.
+- calls: the answers to one keypoint in two calls have at least a certain number of words in common.
 
-The last two compare (d1, d1) with (d1, d2): one descriptor changes, so ε bounds these ratios, too. A memoized defense does not
+The last two compare (d1, d1) with (d1, d2). One descriptor changes, so ε bounds these ratios, too. A memoized defense does not
 guarantee that. For a small dictionary, all pairs of words are compared by enumeration.
 
-Where the guarantee depends on the distance of descriptors, all bounds are divided by the distance of the two, and ε is per unit
-of distance.
+If the guarantee depends on the distance of descriptors, all bounds are divided by the distance of the two, and ε is per unit of
+distance.
 
-All keypoints of one call count as trials, which assumes that a keypoint's answer depends on its own descriptor and on chance.
-Where the answers of one call are overdispersed under that assumption, only one keypoint of each call counts.
+All keypoints of one call count as trials. This assumes that the answer for a keypoint depends on its own descriptor and on chance
+alone. If the answers of one call are overdispersed under that assumption, only one keypoint of each call counts.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ from bench.geometry.nearest_words import unit_rows
 from bench.registry import fields
 from bench.types import Features
 
-TIGHT_FRACTION = 0.9  # of the claimed ε; from here on a bound is called tight
+TIGHT_FRACTION = 0.9  # of the claimed ε; a bound of at least this is called tight
 PAIRS_PER_CALL = 500  # pairs of keypoints in a call
-MIN_CALLS = 400  # if there are enough trials
-MIN_DEVICES = 4000  # likewise for a memoized defense: each call is another device
+MIN_CALLS = 400  # least number of calls, if there are enough trials
+MIN_DEVICES = 4000  # least number of calls for a memoized defense, each as another device, if there are enough trials
 PILOT_CALLS = 20  # calls that select the events; not counted
 MAX_ENUMERATED_WORDS = 6  # greatest dictionary whose outputs are enumerated
 MAX_RUNS = 20_000  # of `protect` in the enumeration, for each word
@@ -59,7 +59,7 @@ OVERDISPERSED = "{}: answers of one call are overdispersed, so only one of each 
 
 @dataclasses.dataclass(frozen=True)
 class Enumeration:
-    """Bounds of the greatest log ratio of an output's probabilities for two words, divided by the distance of the two."""
+    """Bounds of the greatest log ratio of an output's probabilities for two words, divided by the distance of the words."""
 
     low: float
     high: float  # infinite where a probability is indistinguishable from 0
@@ -78,7 +78,7 @@ class Audit:
 
     @property
     def strongest(self) -> Finding:
-        """The finding with the greatest bound on the half of the calls that selects events."""
+        """The finding with the greatest bound in the half of the calls that selects events."""
         return max(self.findings, key=lambda finding: finding.selection_epsilon)
 
     @property
@@ -90,11 +90,11 @@ class Audit:
 
 
 def audit(defense: Defense, words: int | None, trials: int, seed: int, folder: Path) -> Audit:
-    """Audit a defense that claims ε.
+    """Return the audit of a defense that claims an ε.
 
     Parameters
     ----------
-    words : of a synthetic dictionary for the defense; None for its own dictionary, or where it has none
+    words : size of a synthetic dictionary for the defense; None for its own dictionary, or if it has none
     trials : approximate number of releases of each of two descriptors
     seed : of the dictionary and all draws
     folder : for the dictionary
@@ -102,7 +102,7 @@ def audit(defense: Defense, words: int | None, trials: int, seed: int, folder: P
     Raises
     ------
     UserError
-        if the defense claims no ε or has no dictionary, or there are too few trials.
+        if the defense claims no ε, `words` is given and it has no dictionary, or there are too few trials.
     """
     public = Public()
     if words is not None:
@@ -110,9 +110,9 @@ def audit(defense: Defense, words: int | None, trials: int, seed: int, folder: P
     guarantee = defense.privacy(public)
     claimed = guarantee.per_distance if guarantee.epsilon is None else guarantee.epsilon
     if claimed is None:
-        raise UserError(f"{defense.name()}, as configured, claims no epsilon: there is nothing to audit")
+        raise UserError(f"{defense.name()}, as configured, claims no epsilon, so there is nothing to audit")
     if trials < 4:
-        raise UserError(f"an audit needs at least 4 trials, got {trials}")
+        raise UserError(f"--trials: an audit needs at least 4 trials, got {trials}")
     secrets = draw_features(2, seed) if words is None else create_features_near_words(defense, public)
     pair = secrets.take(np.array([0, len(secrets) - 1]))
     distance = float(defense.distance(pair, public, 0, 1))
@@ -133,7 +133,7 @@ def audit(defense: Defense, words: int | None, trials: int, seed: int, folder: P
 
 
 def create_features_near_words(defense: Defense, public: Public) -> Features:
-    """Create features near each word of the defense's dictionary, but different from it."""
+    """Return features near each word of the defense's dictionary, but different from it."""
     (asset,) = fields.list_assets(defense).values()
     used = 0 if defense.word_count_field is None else getattr(defense, defense.word_count_field)
     words = public.dictionary(asset, used).words  # (K, D)
@@ -143,7 +143,7 @@ def create_features_near_words(defense: Defense, public: Public) -> Features:
 
 
 def enumerate_outputs(defense: Defense, secrets: Features, public: Public, claimed: float) -> Enumeration:
-    """Compare the exact laws of the released rows, with their order, for each of `secrets`.
+    """Return bounds of the greatest ratio between the exact laws of the released, ordered rows for any two of `secrets`.
 
     Raises
     ------
@@ -177,7 +177,7 @@ def _replace_dictionary(defense: Defense, words: int, seed: int, folder: Path) -
     if len(assets) != 1:
         raise UserError(f"--words: {defense.name()} has {'no dictionary' if not assets else 'several dictionaries'}")
     if words < 2:
-        raise UserError(f"--words: a dictionary has at least 2 words, not {words}")
+        raise UserError(f"--words: must be at least 2, got {words}")
     return dataclasses.replace(defense, **dict.fromkeys(assets, write_dictionary(folder, words, seed)))  # type: ignore[type-var]
 
 

@@ -1,4 +1,4 @@
-"""Bounds of the ratio of two probabilities from counts (Clopper and Pearson, Biometrika 1934), and a test of dispersion."""
+"""Bounds of the ratio of two probabilities from counts (Clopper and Pearson, Biometrika 1934), and a dispersion test."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ Doubles = NDArray[np.float64]
 
 
 def log_ratio(hits: Any, trials: Any, other_hits: Any, other_trials: Any, confidence: float) -> Doubles:
-    """Return a lower bound of ln(p1 / p2) at this confidence, from independent counts (...). -> (...), −∞ where hits are 0
+    """Return a lower bound of ln(p1 / p2) at this confidence, from independent counts (...). -> (...), −∞ if hits are 0
 
     The lower bound of p1 and the upper bound of p2 each fail with half of the remaining probability.
     """
     rest = (1 - confidence) / 2
     hits, trials = np.asarray(hits, dtype=float), np.asarray(trials, dtype=float)
     other_hits, other_trials = np.asarray(other_hits, dtype=float), np.asarray(other_trials, dtype=float)
-    # Where the formula has no value, it is evaluated at 1 and the result is discarded.
+    # If the formula has no value, it is evaluated at 1 and the result is discarded.
     least = np.where(hits > 0, stats.beta.ppf(rest, np.maximum(hits, 1), trials - hits + 1), 0.0)
     all_hit = other_hits == other_trials
     most = np.where(all_hit, 1.0, stats.beta.isf(rest, other_hits + 1, np.where(all_hit, 1, other_trials - other_hits)))
@@ -28,7 +28,7 @@ def log_ratio(hits: Any, trials: Any, other_hits: Any, other_trials: Any, confid
 
 
 def is_overdispersed(hits: NDArray[np.integer[Any]], trials: int, chance: float = 1e-6) -> bool:
-    """Whether counts of `trials` each vary more than binomial ones, which do so with probability `chance`. hits: (C,)"""
+    """Return whether counts, of `trials` each, vary more than binomial ones. False positives: `chance`. hits: (C,)"""
     calls, total = len(hits), int(hits.sum())
     rate = total / (calls * trials)
     if trials == 1 or rate in (0, 1):

@@ -1,6 +1,6 @@
-"""The events that an audit counts: of one keypoint's answer, and of two answers together.
+"""Events that an audit counts: of the answer to one keypoint, and of two answers together.
 
-A word here is any part of a keypoint's release: a row of the dictionary, a pattern, a descriptor.
+Here a word is any part of a keypoint's release: a row of the dictionary, a pattern, or a descriptor.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from bench.types import Descriptors, Floats, Release, Subspaces, WordSets
 Flags = NDArray[np.bool_]
 Keys = NDArray[np.int64]
 
-EVENT_WORDS = 8  # words that events are about
-QUANTILES = 32  # of projections
+EVENT_WORDS = 8  # number of words for which events are defined
+QUANTILES = 32  # number of quantiles of projections
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +27,7 @@ class Answers:
     """The release of N keypoints."""
 
     words: Keys  # (N, m) numbers that identify words, in the order of the release
-    descriptors: Floats  # (N, D), or (N, 0) where the release is not one descriptor per keypoint
+    descriptors: Floats  # (N, D), or (N, 0) if the release is not one descriptor per keypoint
 
     def take(self, rows: slice) -> Answers:
         return Answers(self.words[rows], self.descriptors[rows])
@@ -75,27 +75,27 @@ class EventFamilies:
     thresholds: Floats  # (Q,) of projections onto the direction, or (0,)
 
     def membership(self, answers: Answers) -> Flags:
-        """Whether a word is in Z; is in Z and another is not; is not in Z. -> (N, E)"""
+        """Return whether a word is in Z; whether it is and another is not; whether it is not in Z. -> (N, E)"""
         inside = (answers.words[:, :, None] == self.words).any(axis=1)  # (N, T)
         return _add_absences(inside, inside)
 
     def position(self, answers: Answers) -> Flags:
-        """The same events for a word at one position of its row. -> (N, E)"""
+        """Return the events of `membership` for a word at one position of its row. -> (N, E)"""
         there = answers.words[:, :, None] == self.words  # (N, m, T)
         return _add_absences(there.reshape(len(there), -1), there.any(axis=1))
 
     def projection(self, answers: Answers) -> Flags:
-        """Whether the projection of a descriptor reaches each threshold; whether not. -> (N, E)"""
+        """Return whether the projection of a descriptor reaches each threshold, and the negations. -> (N, E)"""
         far = (answers.descriptors @ self.direction)[:, None] >= self.thresholds  # (N, Q)
         return np.concatenate([far, ~far], axis=1)
 
     def families(self) -> dict[str, Callable[[Answers], Flags]]:
-        """The families that apply to the release."""
+        """Return the families that apply to the release, by name."""
         families: dict[str, Callable[[Answers], Flags]] = {"membership": self.membership, "position": self.position}
         return families | {"projection": self.projection} if len(self.thresholds) else families
 
     def names(self, size: int) -> dict[str, list[str]]:
-        """The events of each family, in their order, for `size` words per keypoint."""
+        """Return the names of the events of each family, in their order, for `size` words per keypoint."""
         words = [f"word {word}" if 0 <= word < 2**31 else f"answer {number}" for number, word in enumerate(self.words)]
         positions = [f"{word} at position {position + 1}" for position in range(size) for word in words]
         shared = [*(f"{count} or more words in common" for count in range(1, size + 1)), "equal"]
@@ -110,7 +110,7 @@ class EventFamilies:
 
 
 def select_events(first: Sequence[Answers], second: Sequence[Answers], direction: Floats) -> EventFamilies:
-    """Select events from answers to the first descriptor and to the second."""
+    """Return the events with the greatest differences between answers to the first descriptor and to the second."""
     one, other = (np.concatenate([answers.words.ravel() for answers in part]) for part in (first, second))
     words, counts = np.unique(np.concatenate([one, other]), return_counts=True)
     first_counts = np.bincount(np.searchsorted(words, one), minlength=len(words))
@@ -124,7 +124,7 @@ def select_events(first: Sequence[Answers], second: Sequence[Answers], direction
 
 
 def compare_answers(one: Answers, other: Answers) -> Flags:
-    """Whether two answers share at least 1, ..., m words; are equal; and the negations. -> (N, E)"""
+    """Return whether two answers have at least 1, ..., m common words; whether they are equal; the negations. -> (N, E)"""
     shared = (one.words[:, :, None] == other.words[:, None, :]).sum(axis=(1, 2))  # (N,)
     enough = shared[:, None] >= np.arange(1, one.words.shape[1] + 1)
     events = np.concatenate([enough, (one.words == other.words).all(axis=1, keepdims=True)], axis=1)
@@ -132,7 +132,7 @@ def compare_answers(one: Answers, other: Answers) -> Flags:
 
 
 def _add_absences(events: Flags, inside: Flags) -> Flags:
-    """Return each event; each with one of the words absent; each negated. (N, A), (N, T) -> (N, A + A T + A)"""
+    """Return each event, each event with one of the words absent, and each negation. (N, A), (N, T) -> (N, A + A T + A)"""
     absent = events[:, :, None] & ~inside[:, None, :]  # (N, A, T)
     return np.concatenate([events, absent.reshape(len(events), -1), ~events], axis=1)
 

@@ -1,10 +1,10 @@
-"""The exact law of a randomised function's result, by one run for each possible sequence of its random draws.
+"""Exact law of a randomised function's result, by one run for each possible sequence of its random draws.
 
 The function receives a generator that replays given sequences instead of drawing. A draw from more than `SMALL` numbers (64
-random bits, a double in [0, 1)) is not enumerated: where two numbers lead to one law, all between them are assumed to do so;
-otherwise bisection finds the threshold. That is exact for a function that compares such a draw with one threshold, as samplers
-do. `PROBES` further numbers detect other functions. Numbers nearer to a threshold than `NEGLIGIBLE` are left open, and accounted
-for.
+random bits, a double in [0, 1)) is not enumerated. If two numbers lead to the same law, all numbers between them are assumed to
+lead to it. Otherwise bisection finds the threshold. This is exact for a function that compares such a draw with one threshold, as
+samplers do. `PROBES` further numbers detect other functions. Numbers nearer to a threshold than `NEGLIGIBLE` are left open. Their
+probability is part of the bounds.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Randomised = Callable[[np.random.Generator], Hashable]
 
 @dataclass(frozen=True)
 class Law:
-    """Outcomes with their probabilities. They sum to 1 with the probability left open."""
+    """Outcomes with their probabilities, which sum to 1 together with the probability left open."""
 
     chances: Mapping[Hashable, Fraction]
     left_open: Fraction = Fraction(0)
@@ -45,11 +45,11 @@ class NotEnumerableError(UserError):
 
 
 def compute_law(function: Randomised, runs: int = 200_000) -> Law:
-    """Compute the law of `function(rng)`.
+    """Return the law of `function(rng)`.
 
     Parameters
     ----------
-    function : draws only by `rng.integers`, `random`, `permutation` or `choice` (without weights)
+    function : function that draws only by `rng.integers`, `random`, `permutation` or `choice` (without weights)
     runs : greatest number of calls
 
     Raises
@@ -61,7 +61,7 @@ def compute_law(function: Randomised, runs: int = 200_000) -> Law:
 
 
 def bound_greatest_ratio(laws: Sequence[Law]) -> tuple[Fraction | None, Fraction | None]:
-    """Return lower and upper bounds of the greatest quotient of two laws' probabilities of one outcome. None is infinite."""
+    """Return a lower and an upper bound of the greatest quotient of two laws' probabilities of one outcome; None: infinite."""
     outcomes = {outcome for each in laws for outcome in each.chances}
     least = [[each.chances.get(outcome, Fraction(0)) for each in laws] for outcome in outcomes]
     most = [[each.at_most(outcome) for each in laws] for outcome in outcomes]
@@ -75,7 +75,7 @@ def _find_greatest_quotient(over: list[list[Fraction]], under: list[list[Fractio
 
 
 class _Explorer:
-    """Counts the runs of one function."""
+    """Explores the sequences of draws of one function, with a limit on its runs."""
 
     def __init__(self, function: Randomised, runs: int) -> None:
         self._function, self._runs = function, runs
@@ -94,7 +94,7 @@ class _Explorer:
         return self._explore_thresholds(draws, outcomes)
 
     def _explore_thresholds(self, draws: tuple[int, ...], outcomes: int) -> Law:
-        """Return the law where the next draw is from many numbers."""
+        """Return the law for a next draw from many numbers."""
         laws: dict[int, Law] = {}
 
         def evaluate(k: int) -> Law:
@@ -108,7 +108,7 @@ class _Explorer:
                 return [(low, high, evaluate(low))]
             if Fraction(high - low, outcomes) < NEGLIGIBLE:
                 return [(low, high, OPEN)]
-            # Not the exact middle, which may be a threshold: a draw equal to it may lead to endless further draws.
+            # Not the exact middle, which may be a threshold. A draw equal to a threshold may lead to endless further draws.
             middle = low + max(1, (high - low) * 13 // 21)
             return split(low, middle) + split(middle, high)
 
@@ -133,14 +133,14 @@ def _mix_laws(parts: Iterable[tuple[Law, Fraction]]) -> Law:
 
 
 class _PendingDraw(BaseException):  # not an Exception, which the function may catch
-    """The sequence ends before a draw from `outcomes` numbers."""
+    """Raised if the sequence ends before a draw from `outcomes` numbers."""
 
     def __init__(self, outcomes: int) -> None:
         self.outcomes = outcomes
 
 
 class _ReplayGenerator:
-    """Replaces a generator, and replays one sequence of draws."""
+    """A substitute of a generator that replays one sequence of draws."""
 
     def __init__(self, draws: tuple[int, ...]) -> None:
         self._draws = iter(draws)

@@ -1,4 +1,4 @@
-"""Counts of events over many calls; an event is selected on one half of the calls and measured on the other half."""
+"""Counts of events over many calls. An event is selected on one half of the calls and measured on the other half."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from bench.audit.bounds import is_overdispersed, log_ratio
 from bench.audit.events import Flags
 
 CONFIDENCE = 0.95  # of bounds
-CERTAINTY = 1 - 1e-6  # of the verdict `violated`, over all families together
+CERTAINTY = 1 - 1e-6  # of the verdict `violated`, for all families together
 
 
 @dataclass(frozen=True)
@@ -20,13 +20,13 @@ class Finding:
     """Lower bounds of ε from one family of events."""
 
     family: str
-    event: str  # in words
-    rates: tuple[float, float]  # under the input with the greater rate, and under the other one
+    event: str  # its description
+    rates: tuple[float, float]  # for the input with the greater rate, and for the other input
     trials: int  # of each input
     epsilon: float  # lower bound at CONFIDENCE
     certain_epsilon: float  # lower bound at CERTAINTY
     selection_epsilon: float  # lower bound on the half of the calls that selects the event
-    overdispersed: bool  # whether answers of one call vary more than independent ones, so that one of each call is counted
+    overdispersed: bool  # whether answers of one call vary more than independent ones; then one answer of each call counts
 
     def divide_by(self, distance: float) -> Finding:
         """Return the finding with bounds per unit of distance."""
@@ -43,7 +43,7 @@ class Tally:
     """Counts of one family's events under two inputs, call by call."""
 
     hits: list[NDArray[np.int32]] = field(default_factory=list)  # of (2, E), over the pairs of a call
-    first: list[Flags] = field(default_factory=list)  # of (2, E), of the first pair only
+    first: list[Flags] = field(default_factory=list)  # of (2, E), of the first pair of a call only
 
     def add(self, one: Flags, other: Flags) -> None:
         """Count the events of a call's pairs under the two inputs. (P, E), (P, E)"""
@@ -51,7 +51,7 @@ class Tally:
         self.first.append(np.stack([one[0], other[0]]))
 
     def measure(self, family: str, names: Sequence[str], pairs: int, families: int) -> Finding:
-        """Select the event and the input of the greater rate, and measure them.
+        """Select the event and the input of the greater rate, and return the finding.
 
         Parameters
         ----------
@@ -76,7 +76,7 @@ class Tally:
 
 
 def _select_event(hits: NDArray[np.int32], trials: int) -> tuple[int, int, float]:
-    """Return the input and the event with the greatest bound, and the bound. hits: (C, 2, E)"""
+    """Return the input and the event of the greatest bound, and the bound. hits: (C, 2, E)"""
     counts = hits.sum(axis=0)  # (2, E)
     bounds = log_ratio(counts, trials, counts[::-1], trials, CONFIDENCE)
     given, event = divmod(int(bounds.argmax()), bounds.shape[1])

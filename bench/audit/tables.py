@@ -1,4 +1,4 @@
-"""An audit as terminal output."""
+"""Output of an audit on the terminal."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Caches recovered descriptors of expensive attacks, so that another metric or inverter does not run the attack again.
+"""Cache of recovered descriptors of expensive attacks, so that another metric or inverter does not run the attack again.
 
-The key holds the content of the release, the provenance of other releases, the attack's configuration, and the hash of all source
-involved. Of the secret it holds only what was released. The attack never sees the key.
+The key consists of the content of the release, the provenance of other releases, the attack's configuration, and the hash of all
+source involved. It contains no part of the secret that was not released. The attack has no access to the key.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from bench.threat_model import OtherReleases, PublicAssets, PublicDatabase, Repe
 from bench.types import Release
 
 KIND = "recovered"
-MIN_SECONDS = 1.0  # faster attacks are not cached: running them is as quick as reading
+MIN_SECONDS = 1.0  # faster attacks are not cached, since reading the cache takes as long
 # The modules that compute the knowledge of an attack.
 KNOWLEDGE_MODULES = {
     OtherReleases: "bench.runner.other_releases",
@@ -43,7 +43,7 @@ class CachedSelection:
 
 
 def recover_cached(attack: Attack, trial: Trial, view: View) -> CachedSelection:
-    """Run the attack, or return its cached result. `trial.rng` ends in the same state either way."""
+    """Run the attack, or return its cached result. In both cases `trial.rng` ends in the same state."""
     if trial.provenance is None:
         return _run_attack(attack, trial, view)
     spent = 0.0
@@ -104,7 +104,7 @@ def _key(attack: Attack, trial: Trial) -> dict[str, Any]:
 
 
 def _hash_release(release: Release) -> str:
-    """Hash all fields of a release, those of its positions too."""
+    """Return the hash of all fields of a release and of its positions."""
     hashed = hashlib.sha256()
 
     def update(part: Any) -> None:

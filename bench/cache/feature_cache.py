@@ -1,6 +1,6 @@
-"""Caches features of images and the nearest words of their descriptors.
+"""Cache of features of images, and of the nearest words of their descriptors.
 
-Both are secrets of the owner, as the photographs are. Only the benchmark stores them; code that protects photographs does not.
+Both are secrets of the owner, like the photographs. Only the benchmark stores them; code that protects photographs does not.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ MAX_SEQUENTIAL = 16  # images; more are extracted in parallel
 
 
 def extract(extractor: Extractor, pixels: Pixels) -> Features:
-    """Return the features of an image from the cache, or extract them.
+    """Return the features of an image, from the cache or by extraction.
 
     Raises
     ------
@@ -48,7 +48,7 @@ def extract(extractor: Extractor, pixels: Pixels) -> Features:
 
 
 def extract_all(extractor: Extractor, images: Sequence[Pixels]) -> Iterator[Features]:
-    """Yield the features of images. If many are missing in the cache, one process per available thread extracts them.
+    """Yield the features of images. If more than 16 are missing in the cache, one process per available thread extracts them.
 
     Raises
     ------
@@ -68,7 +68,7 @@ def extract_all(extractor: Extractor, images: Sequence[Pixels]) -> Iterator[Feat
 
 
 def _extract_to_cache(extractor: Extractor, pixels: Pixels) -> None:
-    """Extract in a worker process; the result is read from the cache."""
+    """Extract the features in a worker process, and store them in the cache."""
     extract(extractor, pixels)
 
 

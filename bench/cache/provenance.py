@@ -1,6 +1,7 @@
-"""Hashes the source of modules and of their imports, for cache keys.
+"""Hashes of the source of modules and of their imports, for cache keys.
 
-Records hold `environment.hash_source`, the hash of all our source. As a key, it would make a new metric invalidate every entry.
+Records hold `environment.hash_source`, the hash of all our source. With that hash as a key, a new metric would invalidate every
+entry.
 """
 
 from __future__ import annotations

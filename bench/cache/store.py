@@ -1,7 +1,7 @@
-"""Stores results on disk under the hash of their inputs, never by name.
+"""Storage of results on disk by the hash of their inputs, never by name.
 
-A key holds everything that the content depends on: configuration, hashes of inputs, and the hash of the source that computes it.
-Damaged entries are computed again. If the folder is not writable, nothing is stored. All entries may be removed at any time.
+A key contains everything that the content depends on: configuration, hashes of inputs, and the hash of the source that computes
+it. Damaged entries are computed again. If the folder is not writable, nothing is stored. All entries may be removed at any time.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def use_folder(folder: Path) -> Iterator[None]:
 
 
 def fetch(kind: str, key: Any, compute: Callable[[], Content], min_seconds: float = 0.0) -> Content:
-    """Return arrays and metadata from the cache, or from `compute`.
+    """Return arrays and metadata, from the cache or by `compute`.
 
     Parameters
     ----------
@@ -97,12 +97,12 @@ def store_file(kind: str, key: Any, file: Path) -> None:
 
 
 def fetch_folder(kind: str, key: Any, fill: Callable[[Path], None]) -> Path:
-    """Return a folder from the cache, or let `fill` write its files.
+    """Return a folder of the cache. If it is missing, `fill` writes its files.
 
     Raises
     ------
     OSError
-        if it cannot be written.
+        if the folder cannot be written.
     """
     folder = entry_path(kind, key).with_suffix("")
     if folder.is_dir():
@@ -138,7 +138,7 @@ class Entry:
     used: float  # time of the last use; seconds since the epoch
 
     def find_fault(self) -> str | None:
-        """Read the whole content and return its fault; None if there is none."""
+        """Read the whole content, and return a description of its fault; None if there is none."""
         return _find_fault(self.path)
 
     def remove(self) -> None:
@@ -160,7 +160,7 @@ def list_entries() -> Iterator[Entry]:
 
 def _find_fault(path: Path) -> str | None:
     if path.name.endswith(".unfinished"):
-        return f"{path}: was never finished"
+        return f"{path}: incomplete, its writer ended early"
     if path.is_dir():
         sums = path / SUMS
         listed = [line.split("  ", 1) for line in sums.read_text().splitlines()] if sums.is_file() else []

@@ -1,4 +1,4 @@
-"""The command line. Each command imports its heavy libraries itself, so that `bench --help` is quick."""
+"""The command line. Each command imports its heavy libraries when it is executed, so `bench --help` is fast."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import importlib
 import os
 import pkgutil
 import re
+import shlex
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
@@ -16,7 +17,7 @@ from bench.cli import commands
 from bench.cli.terminal import BROKEN_PIPE, FAILED, INTERRUPTED, MISTAKE, print_status, require
 from bench.core.errors import UserError, unknown_name
 
-RESUME = "finished records are kept; run the same command again to go on"
+RESUME = "finished records are stored; run the same command again to continue"
 
 EXAMPLES = """examples:
   bench run --defense ldp --attack dia
@@ -47,7 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return print_status(INTERRUPTED, f"interrupted; {RESUME}")
     except MemoryError:
-        return print_status(FAILED, f"out of memory; {RESUME}, with fewer defenses if it happens again")
+        return print_status(FAILED, f"out of memory; {RESUME}, with fewer defenses if the error repeats")
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # else Python's final flush fails again
         return BROKEN_PIPE
@@ -57,7 +58,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 class Parser(argparse.ArgumentParser):
-    """Raises `UserError` for invalid arguments."""
+    """Parser that raises `UserError` for invalid arguments."""
 
     def error(self, message: str) -> NoReturn:
         raise UserError(message)
@@ -69,11 +70,11 @@ def list_commands() -> list[str]:
 
 
 def build_parser() -> Parser:
-    """Return the parser of all commands. Its result has `execute`, `required` (names of required options) and `help`."""
+    """Return the parser of all commands. Parsed arguments have `execute`, `required` (names of required options) and `help`."""
     text = argparse.RawDescriptionHelpFormatter
     top = Parser(
         prog="bench",
-        description="The privacy benchmark for local image features: what an attacker still sees, what a server can still do.",
+        description="Privacy benchmark for local image features: reconstruction by an attacker, and utility for a server.",
         epilog=EXAMPLES,
         formatter_class=text,
         allow_abbrev=False,
@@ -91,9 +92,19 @@ def build_parser() -> Parser:
     return top
 
 
+def format_command(argv: Sequence[str]) -> str:
+    """Return the command line without `--out`, which changes no result.
+
+    >>> format_command(["run", "--defense", "ldp", "--out", "runs/x"])
+    'bench run --defense ldp'
+    """
+    pairs = zip(["", *argv], argv, strict=False)
+    return shlex.join(["bench", *(word for before, word in pairs if "--out" not in (before, word.partition("=")[0]))])
+
+
 def _run_command(argv: list[str]) -> int:
     if argv and not argv[0].startswith("-") and argv[0] not in list_commands():
-        raise unknown_name("command", argv[0], list_commands())  # the message of argparse has no hint
+        raise unknown_name("command", argv[0], list_commands())  # argparse suggests no similar name
     args, extra = build_parser().parse_known_args(argv)
     if "execute" not in args:
         raise UserError(f"give a command: {', '.join(list_commands())} (see bench --help)")
@@ -103,4 +114,5 @@ def _run_command(argv: list[str]) -> int:
             raise unknown_name("option", option, set(re.findall(r"--[a-z][a-z-]*", args.help)))
         raise UserError(f"{extra[0]!r} is an unexpected argument")
     require(args, args.required, argv[0])
+    args.command = format_command(argv)
     return int(args.execute(args))

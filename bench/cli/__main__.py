@@ -1,4 +1,4 @@
-"""`python -m bench.cli` is the same as `bench`."""
+"""Entry point of `python -m bench.cli`, which is equivalent to `bench`."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""The output of `bench list`: plugins with their fields, and which attack applies to which defense."""
+"""The output of `bench list`: plugins with their fields, and the applicability of attacks to defenses."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SECTIONS: dict[str, Kind] = {
 
 
 def build_listing(section: str | None) -> Iterator[Table | RichTable | Text]:
-    """Yield one section, or all sections and the matrix of attacks and defenses.
+    """Yield one section, or all sections. With defenses or attacks, the table of applicability follows.
 
     Raises
     ------
@@ -59,7 +59,7 @@ def _format(value: Any) -> str:
 
 
 def _build_matrix() -> Table:
-    """Return the table of which attack applies to which defense, all with default fields."""
+    """Return the table of the applicability of each attack to each defense, with default fields."""
     public = Public()
     task, extractor = spec.read("reconstruction", discovery.TASK), spec.read("sift", discovery.EXTRACTOR)
     defenses, attacks = discovery.load_plugins(discovery.DEFENSE), discovery.load_plugins(discovery.ATTACK)

@@ -1,4 +1,4 @@
-"""Tables of the status of runs, for the terminal."""
+"""Tables for the terminal with the status of runs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def build_status_table(out: Path) -> Iterator[Table | str]:
     Raises
     ------
     UserError
-        as `status`.
+        if nothing was run there, or a file of the folder is damaged.
     """
     run = read_status(out)
     names = build_labels([(experiment.metadata["defense"], experiment.metadata["attack"]) for experiment in run.experiments])

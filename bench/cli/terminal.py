@@ -10,12 +10,12 @@ from collections.abc import Iterable
 from bench.core.errors import UserError
 
 DONE, FAILED, MISTAKE, REGRESSION, INTERRUPTED = 0, 1, 2, 3, 130
-BROKEN_PIPE = 141  # exit status of a program that SIGPIPE ended, as in a shell
-PIPED_WIDTH = 400  # columns of a table in a file: wide, so that cells are not folded and can be searched
+BROKEN_PIPE = 141  # exit status of a program that SIGPIPE ended, as a shell reports it
+PIPED_WIDTH = 400  # width of a table in a file, in characters: wide, so that text is not wrapped and can be searched
 
 
 def require(args: argparse.Namespace, options: Iterable[str], command: str) -> None:
-    """Raise UserError if one of these options is missing."""
+    """Raise UserError if one of `options` is missing."""
     for option in options:
         if getattr(args, option) in (None, ""):
             raise UserError(f"--{option.replace('_', '-')} is missing (see bench {command} --help)")
@@ -28,14 +28,14 @@ def print_status(status: int, line: str) -> int:
 
 
 def print_rich(*items: object) -> None:
-    """Print tables, texts, and what rich can draw."""
+    """Print tables, texts and other objects that rich can draw."""
     from rich.console import Console
     from rich.text import Text
 
     from bench.core.table import Table, to_terminal
 
     console = Console(width=None if sys.stdout.isatty() else PIPED_WIDTH)
-    # Rich itself exits with status 1 on a closed pipe, which has another meaning here.
+    # On a closed pipe rich exits with status 1, which has another meaning here.
     with console.capture() as captured:
         for item in items:
             console.print(to_terminal(item) if isinstance(item, Table) else Text(item) if isinstance(item, str) else item)
@@ -81,7 +81,7 @@ def add_engine(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--workers", type=parse_whole, default=1, metavar="N", help="worker processes (default: %(default)s)")
     parser.add_argument("--engine", metavar="NAME", default="processes", help="processes or dask (default: %(default)s)")
     parser.add_argument(
-        "--scheduler", metavar="ADDRESS", help="address of dask's scheduler, such as tcp://127.0.0.1:8786 (docs/sweeps.md)"
+        "--scheduler", metavar="ADDRESS", help="address of dask's scheduler, such as tcp://127.0.0.1:8786 (docs/running.md)"
     )
 
 

@@ -1,4 +1,4 @@
-"""Shows a run on the terminal: progress, notes and failures."""
+"""Execution of a run with its progress, notes and failures on the terminal."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from bench.runner.records import Record
 
 
 def execute_with_progress(plans: Sequence[Plan], out: Path, engine: Engine, title: str) -> list[Record]:
-    """Execute plans with a progress bar. Returns the records in the order of the plans."""
+    """Execute plans with a progress bar, and return the records in the order of the plans."""
     records: list[Record] = []
     shown_notes: set[str] = set()
     with Progress(title, sum(map(len, plans))) as progress:

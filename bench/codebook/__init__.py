@@ -1,1 +1,1 @@
-"""Dictionaries and databases of descriptors: build, load, quantise."""
+"""Dictionaries and databases of descriptors: construction, loading, quantisation."""

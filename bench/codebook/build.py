@@ -1,7 +1,7 @@
-"""Builds a dictionary by spherical k-means in two levels.
+"""Construction of a dictionary by spherical k-means in two levels.
 
-The descriptors are those of every view of each photograph (`bench.images.views`). About sqrt(K) coarse clusters are built
-first. Each then gets words in proportion to its descriptors and is clustered separately. An iteration costs about
+The descriptors are those of every view of each photograph (`bench.images.views`). About sqrt(K) coarse clusters are built first.
+Each of them gets a number of words in proportion to its descriptors, and is then clustered separately. An iteration costs about
 4·n·sqrt(K)·D operations; brute force takes 2·n·K·D. Centroids are rounded to 8 bits at SIFT's norm of 512.
 """
 
@@ -24,11 +24,11 @@ from bench.types import Bytes, Floats
 
 ITERATIONS = 12
 NORM = 512.0  # of SIFT's 8-bit vectors
-SAMPLE = 20_000  # descriptors for the reported mean cosine
+SAMPLE = 20_000  # number of descriptors for the reported mean cosine
 
 
 def build(images: Path, size: int, out: Path, extractor: Extractor, seed: int) -> Dictionary:
-    """Cluster the descriptors of a folder's photographs into `size` words and write them to `out`.
+    """Cluster the descriptors of a folder's photographs into `size` words, write them to `out`, and return the dictionary.
 
     Raises
     ------
@@ -65,7 +65,7 @@ def mean_cosine(codes: Bytes, words: Bytes) -> float:
 
 
 def cluster(codes: Bytes, size: int, rng: np.random.Generator) -> Bytes:
-    """Cluster by spherical k-means in two levels. (n, D) uint8 -> (size, D) uint8 distinct words in random order"""
+    """Return distinct words in random order, by spherical k-means in two levels. (n, D) uint8 -> (size, D) uint8"""
     rows = unit_rows(codes)
     coarse = max(1, round(size**0.5))
     clusters = _assign(rows, _run_kmeans(rows, coarse, rng))
@@ -83,7 +83,7 @@ def cluster(codes: Bytes, size: int, rng: np.random.Generator) -> Bytes:
 
 
 def _run_kmeans(rows: Floats, k: int, rng: np.random.Generator) -> Floats:
-    """(n, D) unit rows -> (k, D) unit centres"""
+    """Return the centres of k-means. (n, D) unit rows -> (k, D) unit rows"""
     import faiss
 
     if len(rows) == k:
@@ -108,7 +108,7 @@ def _assign(rows: Floats, centres: Floats) -> np.ndarray:
 
 
 def _apportion(counts: np.ndarray, size: int) -> np.ndarray:
-    """Split `size` words in proportion to `counts` by largest remainders. No cluster gets more words than descriptors."""
+    """Return `size` split in proportion to `counts`, by largest remainders. No cluster gets more words than descriptors."""
     exact = counts * (size / counts.sum())
     word_counts = np.floor(exact).astype(np.int64)
     missing = size - word_counts.sum()
@@ -117,13 +117,13 @@ def _apportion(counts: np.ndarray, size: int) -> np.ndarray:
 
 
 def _make_distinct(words: Bytes, codes: Bytes, rng: np.random.Generator) -> Bytes:
-    """Replace words that are zero or duplicates after rounding by descriptors that are not words yet."""
+    """Return the words, with descriptors in place of words that rounding made zero or equal to another word."""
     size = len(words)
     distinct = np.unique(words[words.any(axis=1)], axis=0)
     while len(distinct) < size:
         candidates = codes[rng.choice(len(codes), min(len(codes), 4 * (size - len(distinct))), replace=False)]
         grown = np.unique(np.concatenate([distinct, candidates]), axis=0)
         if len(grown) == len(distinct) and len(np.unique(codes, axis=0)) + len(distinct) < size:
-            raise UserError(f"--size {size}: there are fewer distinct descriptors than that; use fewer words or more photographs")
+            raise UserError(f"--size {size}: there are fewer distinct descriptors; use fewer words or more photographs")
         distinct = grown
     return distinct[rng.choice(len(distinct), size, replace=False)] if len(distinct) > size else distinct

@@ -1,4 +1,4 @@
-"""Dictionaries of descriptors: the K of LDP-Feat, the W of affine lifting, the attacker's Z.
+"""Dictionaries of descriptors: K of LDP-Feat, W of affine lifting, and Z of the attacker.
 
 Rows are in random order, fixed when the dictionary is built. Affine lifting splits them into n sub-databases of equal length
 (to within one): sub-database s holds rows floor(s K / n) up to floor((s + 1) K / n).
@@ -41,29 +41,29 @@ class Dictionary:
 
     @cached_property
     def index(self) -> WordIndex:
-        """The index that finds the nearest words of descriptors."""
+        """Search index for the nearest words of descriptors."""
         return WordIndex(self.words)
 
     @cached_property
     def neighbours(self) -> Neighbours:
-        """The index that finds words near to words."""
+        """Search index for words near other words."""
         return Neighbours(self.words)
 
     @cached_property
     def mean(self) -> NDArray[np.float64]:
-        """The direction of the mean of the unit words. -> (D,)"""
+        """Direction of the mean of the unit words. -> (D,)"""
         lengths = np.linalg.norm(self.words.astype(np.float32), axis=1).astype(np.float64)
         total = (1 / lengths) @ self.words  # 8-bit numbers, weighted in float64
         return total / np.linalg.norm(total)
 
     def first(self, count: int) -> Dictionary:
-        """Return the dictionary of the first `count` words, or of all. Rows are in random order, so any subset is as good."""
+        """Return the dictionary of the first `count` words, at most of all: a random sample, since rows are in random order."""
         if count >= len(self):
             return self
         return Dictionary(self.words[:count], self.meta, f"{self.digest}, first {count}")
 
     def sub_database(self, index: int, count: int) -> Bytes:
-        """Return the rows of sub-database `index` of `count` (rule: top of this file)."""
+        """Return the rows of sub-database `index` of `count`, by the rule at the top of this file."""
         return self.words[self.start(index, count) : self.start(index + 1, count)]
 
     def start(self, index: int, count: int) -> int:
@@ -72,6 +72,7 @@ class Dictionary:
 
 
 def save(path: Path, words: Bytes, meta: dict[str, Any]) -> Dictionary:
+    """Write words (K, D) and their metadata to a file, and return the dictionary."""
     return Dictionary(words, meta, tensor_file.save(path, KIND, {"words": words}, meta))
 
 

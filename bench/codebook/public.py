@@ -30,10 +30,10 @@ class Public:
 
     Parameters
     ----------
-    quantiser : finds the nearest words of (N, D) rows in a dictionary
+    quantiser : function that finds the nearest words of (N, D) rows in a dictionary
     cache_size : number of photographs whose quantisation is cached; 0 makes quantisation thread-safe
-    dictionaries : further dictionaries by name, from memory
-    scene_index : of the server; the dictionary `references` is built from its reference images
+    dictionaries : further dictionaries by name, held in memory
+    scene_index : the server's index; the dictionary `references` is built from its reference images
     """
 
     def __init__(
@@ -50,9 +50,9 @@ class Public:
         self._cache_size = cache_size
 
     def dictionary(self, asset: str, words: int = 0) -> Dictionary:
-        """Return the first `words` words (0: all) of `shipped`, `shipped-public` or a file.
+        """Return the first `words` words (0: all) of `shipped`, of `shipped-public` or of a file.
 
-        For `references`: cluster that many words from the reference images of the scene.
+        For `references`, return that many words, clustered from the reference images of the scene.
 
         Raises
         ------
@@ -60,7 +60,7 @@ class Public:
             if the dictionary is missing or damaged.
         """
         if (asset, words) not in self._dictionaries:
-            if asset == REFERENCES:  # clustered into exactly that many words: the first of more words would be worse
+            if asset == REFERENCES:  # clustered into exactly that many words; the first words of a larger clustering are worse
                 result = self._require_scene_index().build_dictionary(words)
             else:
                 result = self.dictionary(asset).first(words) if words else dictionary.load(dictionary_path(asset))
@@ -79,11 +79,11 @@ class Public:
 
     def _require_scene_index(self) -> SceneIndex:
         if self.scene_index is None:
-            raise UserError(f"dictionary={REFERENCES} is built from the reference images of a scene, but this task has no scene")
+            raise UserError(f"dictionary={REFERENCES}: needs the reference images of a scene, but this task has no scene")
         return self.scene_index
 
     def nearest_words(self, asset: str, features: Features, words: int = 0) -> Indices:
-        """Return the word of greatest cosine among the first `words` for each descriptor, ties to the lowest.
+        """Return for each descriptor the word of greatest cosine among the first `words` (0: all), ties to the lowest index.
 
         -> (N,) int64, a copy
 
@@ -115,7 +115,7 @@ class Public:
 
 
 def dictionary_path(asset: str) -> Path:
-    """Return the file of an asset."""
+    """Return the path of an asset's file."""
     if asset in SHIPPED:
         path = ASSETS / SHIPPED[asset]
         if not path.is_file():

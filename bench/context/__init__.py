@@ -1,1 +1,1 @@
-"""The context model: weighs the words of a set by the sets of nearby keypoints. Used by the attack `context`."""
+"""The context model of the attack `context`: it weights the words of a set by the sets of nearby keypoints."""

@@ -1,4 +1,4 @@
-"""Encodes releases as graphs: candidates, their prior odds, and the neighbours of each keypoint."""
+"""Encoding of releases as graphs: candidates, their prior odds, and the neighbours of each keypoint."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ MAX_LOG_ODDS = 20.0  # limit of the log odds in both directions
 
 
 def log_odds(log10_true: float, size: int) -> float:
-    """Return the log odds of a candidate to be the true word, over none of the candidates to be it.
+    """Return ln(p / q): p is the chance that a given candidate is the true word, q that none of the `size` candidates is.
 
-    `log10_true` is the log chance that the true word is among the candidates.
+    `log10_true` is log10 of the chance that the true word is among the candidates.
     """
     log_true = log10_true * math.log(10)
     if log_true == 0:
@@ -41,7 +41,7 @@ def prior_odds(defense: Defense, public: Public, size: int) -> float:
 
 
 def build_graph(releases: Sequence[WordSets], odds: Sequence[float], neighbours: int) -> KeypointGraph:
-    """Join releases with equally many candidates per keypoint into one graph, without edges between releases."""
+    """Return one graph of several releases with equally many candidates per keypoint. No edge connects two releases."""
     import torch
 
     neighbour_indices, offsets, present, positions = [], [], [], []
@@ -64,7 +64,7 @@ def build_graph(releases: Sequence[WordSets], odds: Sequence[float], neighbours:
 
 
 def find_nearest_keypoints(keypoints: Floats, neighbours: int) -> tuple[Indices, Floats]:
-    """Return the nearest other keypoints of each, and 1 where there is one, else 0. (N, 2) -> (N, k), (N, k) float32"""
+    """Return the k nearest other keypoints of each, and 1 for those that exist, else 0. (N, 2) -> (N, k), (N, k) float32"""
     from sklearn.neighbors import NearestNeighbors
 
     count = len(keypoints)

@@ -5,12 +5,12 @@ candidate is its prior odds and its frequency at that position. A pair of candid
 
     log P(w, w' | Δ) / P(w) P(w') = q(w) · (g(Δ) ∘ k(w'))
 
-of low rank, with Δ the displacement between the two. SIFT is upright, so direction is informative as well as distance. "None" has
-ratio 1 with everything, since wrong words are uniform. Belief propagation passes messages between neighbours. Loops in the graph
-count evidence twice, so each message has a learned weight in [0, 1], its trust.
+of low rank, with Δ the displacement between the two. SIFT is upright, so direction and distance are both informative. "None" has
+ratio 1 with every candidate, since wrong words are uniform. Belief propagation passes messages between neighbours. Loops in the
+graph count evidence twice, so each message has a learned weight in [0, 1], its trust.
 
-Further layers combine more than two keypoints: they gather the beliefs of neighbours with learned functions of the displacement.
-They update the odds of the candidates, and predict the descriptor for the case that the true word is none of them.
+Further layers combine more than two keypoints. They gather the beliefs of neighbours with learned functions of the displacement.
+They update the odds of the candidates, and predict the descriptor for the case that no candidate is the true word.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class KeypointGraph:
     positions: Tensor  # (P, 2) in [-1, 1]
     neighbours: Tensor  # (P, k) int64, the nearest other keypoints
     offsets: Tensor  # (P, k, 2) pixels from a keypoint to those
-    present: Tensor  # (P, k) float32, 0 if there are fewer than k others, else 1
+    present: Tensor  # (P, k) float32, 1 for neighbours that exist, else 0
 
     def to(self, device: torch.device) -> KeypointGraph:
         return KeypointGraph(*(value.to(device) for value in vars(self).values()))
@@ -58,7 +58,7 @@ class KeypointGraph:
 
 @dataclass(frozen=True, eq=False)
 class Belief:
-    """The posterior of the network."""
+    """Posterior of the network."""
 
     odds: Tensor  # (P, m) posterior log odds of each candidate over none
     expected: Tensor  # (P, D) mean descriptor if the true word is none of them, of any norm
@@ -111,7 +111,7 @@ class ContextModel(nn.Module):
         return Belief(odds, self.expect(state) / self.scale)
 
     def log_ratios(self, words: Tensor, shift: Tensor, neighbours: Tensor) -> Tensor:
-        """Return the log-ratio of each candidate with each candidate of a neighbour.
+        """Return the log-ratio of each candidate of a keypoint with each candidate of each neighbour.
 
         (P, m, width), (P, k, HIDDEN), (P, k) -> (P, k, m, m)
         """
@@ -172,7 +172,7 @@ def propagate(alone: Tensor, ratios: Tensor, trust: Tensor, neighbours: Tensor, 
 
 
 def compute_probabilities(odds: Tensor) -> Tensor:
-    """Return the probabilities of the candidates; with that of none they sum to 1. (P, m) -> (P, m)"""
+    """Return the probabilities of the candidates, which sum to 1 with that of none. (P, m) -> (P, m)"""
     return torch.cat([odds, torch.zeros_like(odds[:, :1])], dim=1).softmax(dim=1)[:, :-1]
 
 

@@ -1,7 +1,6 @@
-"""Trains the context model: which words occur near which in public photographs.
+"""Training of the context model on co-occurrences of words in public photographs.
 
-The loss is the cross-entropy of the true word among the candidates and "none of them", plus one minus the cosine between the
-posterior mean and the true descriptor.
+loss = cross-entropy of the true word among the candidates and "none of them" + 1 − cosine(posterior mean, true descriptor)
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ class Example:
 def build_example(
     secrets: Sequence[Features], defenses: Sequence[Defense], public: Public, neighbours: int, rng: np.random.Generator
 ) -> Example:
-    """Release each secret by its defense. All defenses release equally many words."""
+    """Return the example of several secrets, each released by its defense. All defenses release equally many words."""
     releases, odds, labels = [], [], []
     for secret, defense in zip(secrets, defenses, strict=True):
         release = defense.protect(secret, public, rng)
@@ -101,7 +100,7 @@ def compute_loss(module: ContextModel, example: Example) -> Tensor:
 
 
 def fit(shape: Shape, draw: Callable[[np.random.Generator], Example], training: Training) -> ContextModel:
-    """Train from random weights on examples drawn with generators of seed (seed, step), and return the moving average."""
+    """Train from random weights, with examples of the seeds (seed, step), and return the network of averaged weights."""
     torch.manual_seed(training.seed)
     device = pick_device()
     module = ContextModel(shape).to(device)
@@ -118,7 +117,7 @@ def fit(shape: Shape, draw: Callable[[np.random.Generator], Example], training: 
             value.backward()
             torch.nn.utils.clip_grad_norm_(module.parameters(), 1.0)
             optimizer.step()
-            decay = min(training.average, (step + 1) / (step + 10))  # short memory while the weights still change fast
+            decay = min(training.average, (step + 1) / (step + 10))  # small at first, while the weights change fast
             for name, weight in module.state_dict().items():
                 average[name].lerp_(weight, 1 - decay)
             smooth = float(value.detach()) if math.isnan(smooth) else 0.98 * smooth + 0.02 * float(value.detach())
@@ -134,8 +133,8 @@ def validate(
 ) -> dict[str, float]:
     """Return means over photographs.
 
-    `posterior` and `prior` are cross-entropies in nats; `picked` is the fraction of keypoints whose true word is the likeliest
-    candidate, `chance` the same for a random candidate. `angle` is between the posterior mean and the descriptor, in degrees.
+    `posterior` and `prior` are cross-entropies in nats. `picked` is the fraction of keypoints whose true word is the likeliest
+    candidate; `chance` is this fraction for a random candidate. `angle`, in degrees, is between posterior mean and descriptor.
     """
     scores = []
     for number, secret in enumerate(secrets):

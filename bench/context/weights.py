@@ -1,4 +1,4 @@
-"""The network on disk: half-precision safetensors whose metadata describe the releases that it was trained for."""
+"""Network file: half-precision safetensors, whose metadata describe the releases of the training."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Network(NetworkFile):
 
 
 def save(path: Path, module: ContextModel, meta: dict[str, Any]) -> str:
-    """Write the weights in half precision, where they fit into it, and return the file's digest."""
+    """Write the weights, in half precision unless a value overflows, and return the digest of the file."""
     arrays = {name: tensor_file.to_half(value.cpu().numpy()) for name, value in module.state_dict().items()}
     return tensor_file.save(path, KIND, arrays, {**meta, "shape": asdict(module.shape)})
 

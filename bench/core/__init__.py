@@ -1,1 +1,1 @@
-"""Errors, exact numbers, hashes, devices, threads, randomness, progress and the environment. Imports no other layer."""
+"""Errors, exact numbers, hashes, devices, threads, randomness, progress and the environment. The lowest layer."""

@@ -1,4 +1,4 @@
-"""Silences COLMAP's log, which has lines for every image."""
+"""Suppression of COLMAP's log, which has lines for every image."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ ERRORS = 2  # level of glog
 
 @contextmanager
 def silence_colmap() -> Iterator[None]:
-    """Log COLMAP's errors only, inside a `with` statement."""
+    """Suppress all messages of COLMAP except errors, inside a `with` statement."""
     import pycolmap
 
     before = pycolmap.logging.minloglevel

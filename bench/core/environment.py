@@ -1,6 +1,6 @@
 """The environment of a run: our own source, the libraries, the device.
 
-Every record holds it. A resumed run skips the records of the same environment only.
+Every record holds it. A resumed run skips a record only if its environment is the same.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def describe(plugins: Iterable[object]) -> dict[str, Any]:
 
 
 def describe_platform() -> dict[str, Any]:
-    """Return what numbers may depend on besides our own source: Python, libraries, machine, device, threads."""
+    """Return the parts of the environment besides our own source: Python, libraries, machine, device, threads."""
     import torch
 
     from bench.core.device import pick_device, pick_dtype

@@ -1,4 +1,4 @@
-"""Numbers that keep the decimal or fraction as written beside the nearest double."""
+"""Numbers that store the decimal or fraction as written, beside the nearest double."""
 
 from __future__ import annotations
 
@@ -47,6 +47,6 @@ def to_fraction(value: str | float | Decimal | Fraction) -> Fraction:
     """
     if isinstance(value, Exact):
         if value.fraction is None:
-            raise OverflowError("infinity is no fraction")
+            raise OverflowError("infinity is not a fraction")
         return value.fraction
     return Fraction(repr(float(value)) if isinstance(value, float) else value)

@@ -1,4 +1,4 @@
-"""Hashes of JSON values. They identify configurations, inputs and results."""
+"""Hashes of JSON values, which identify configurations, inputs and results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Progress on stderr: a bar on a terminal, else a line every 20 seconds."""
+"""Progress on stderr: a bar on a terminal, or a line every 20 seconds elsewhere."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ INTERVAL = 20.0  # seconds between lines if stderr is not a terminal
 
 
 class Progress:
-    """Shows how much of `total` is done. `log` prints a line above the bar."""
+    """Shows the progress of `total` steps. `log` prints a line above the bar."""
 
     def __init__(self, title: str, total: int) -> None:
         self._title, self._total, self._done = title, total, 0

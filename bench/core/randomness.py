@@ -1,4 +1,4 @@
-"""Random generators derived from their purpose. No result depends on the order of computations."""
+"""Random generators derived from their purpose, so that no result depends on the order of computations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A table, and its four writers: for a terminal, as Markdown, as CSV and as LaTeX."""
+"""Tables, and their writers: for a terminal, as Markdown, as CSV and as LaTeX."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NOT_APPLICABLE = "n/a"
 
 @dataclass(frozen=True, kw_only=True)
 class Column:
-    """The heading of a column, and what it holds: text, which is aligned left and escaped, or numbers."""
+    """Heading and kind of a column: text is aligned left and escaped, numbers are aligned right."""
 
     label: str
     text: bool = False
@@ -28,15 +28,15 @@ class Column:
 class Row:
     """One row."""
 
-    texts: tuple[str, ...]  # for people, one per column
-    values: Mapping[str, Any] = field(default_factory=dict)  # for programs, by name, in full precision
+    texts: tuple[str, ...]  # rounded, for reading; one per column
+    values: Mapping[str, Any] = field(default_factory=dict)  # by name, in full precision, for programs
     note: str = ""
-    best: frozenset[int] = frozenset()  # indexes of the columns that are printed in bold
+    best: frozenset[int] = frozenset()  # indices of the columns in bold
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Table:
-    """Rows under columns, with a heading above and remarks below. Equal notes share one number."""
+    """Rows under columns, with a heading above and remarks below. Equal notes have one number."""
 
     columns: tuple[Column, ...]
     rows: tuple[Row, ...]
@@ -63,7 +63,7 @@ def build_table(
 
 
 def to_terminal(table: Table) -> RichTable:
-    """Return the table as rich draws it, with its numbered notes and its remarks below."""
+    """Return the table for rich, with its numbered notes and its remarks below."""
     from rich.table import Table as RichTable
     from rich.text import Text
 
@@ -80,7 +80,7 @@ def to_terminal(table: Table) -> RichTable:
 def to_markdown(table: Table, *, plain: bool = False) -> str:
     """Return the table as Markdown, with its heading, its numbered notes and its remarks.
 
-    `plain` escapes bars and line breaks alone, aligns nothing and omits the notes: for texts of this program's own.
+    `plain` is for texts of this program: only bars and line breaks are escaped, no column is aligned, and notes are omitted.
     """
     escape = str if plain else escape_markdown
     numbers = _number_notes(table)
@@ -98,7 +98,7 @@ def to_markdown(table: Table, *, plain: bool = False) -> str:
 
 
 def to_csv(*tables: Table) -> str:
-    """Return the values of all rows in full precision, or their texts where a row has no values.
+    """Return the values of all rows in full precision, or the texts of rows without values.
 
     A value with `mean`, `low` and `high` takes three columns. A row has n/a in the columns that its table lacks.
     """
@@ -116,7 +116,7 @@ def to_csv(*tables: Table) -> str:
 
 
 def write_csv(records: Sequence[Mapping[str, Any]]) -> str:
-    """Return records as CSV in full precision; n/a stands for None, NaN and a name that a record lacks."""
+    """Return records as CSV in full precision. None, NaN and missing names are written as n/a."""
     out = io.StringIO()
     names = dict.fromkeys(name for record in records for name in record)
     writer = csv.DictWriter(out, list(names), restval=NOT_APPLICABLE, lineterminator="\n")
@@ -126,7 +126,7 @@ def write_csv(records: Sequence[Mapping[str, Any]]) -> str:
 
 
 def to_latex(table: Table) -> str:
-    """Return a booktabs table, to be read by \\input; its notes and remarks stand below it."""
+    """Return a booktabs table for \\input, with its notes and remarks below."""
     numbers = _number_notes(table)
     layout = "".join("l" if column.text else "r" for column in table.columns)
     lines = [
@@ -169,7 +169,7 @@ def _number_notes(table: Table) -> dict[str, int]:
 
 
 def _annotate(table: Table, row: Row, numbers: Mapping[str, int], escape: Callable[[str], str]) -> list[str]:
-    """Return the texts of a row, with the number of its note. Numbers are not escaped."""
+    """Return the texts of a row, with the number of its note. Columns of numbers are not escaped."""
     texts = [escape(text) if column.text else text for column, text in zip(table.columns, row.texts, strict=True)]
     if row.note:
         texts[table.note_column] += f" [{numbers[row.note]}]"
@@ -177,7 +177,7 @@ def _annotate(table: Table, row: Row, numbers: Mapping[str, int], escape: Callab
 
 
 def _expand(name: str, value: Any) -> dict[str, str]:
-    """Return the three columns of an interval; an end that is not finite does not apply."""
+    """Return the three columns of an interval. An end that is not finite is n/a."""
     ends = (value.mean, value.low, value.high) if hasattr(value, "low") else (None,) * 3
     texts = (_exact(end if end is not None and math.isfinite(end) else None) for end in ends)
     return dict(zip((name, f"{name}_low", f"{name}_high"), texts, strict=True))
@@ -207,6 +207,6 @@ _LATEX = {letter: f"\\{letter}" for letter in "{}$&#_%"} | {
     "∞": r"$\infty$",
     "°": r"$^\circ$",
     "`": r"\textasciigrave{}",
-    "[": "{[}",  # so that a row which begins with it is not read as an argument of the line before
+    "[": "{[}",  # at the start of a row it would be an argument of the previous line
     "]": "{]}",
 }

@@ -1,4 +1,4 @@
-"""Limits the threads of a process, so that processes can share a machine."""
+"""Limits on the threads of a process, so that several processes can use one machine."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def count_cores() -> int:
 def limit_threads(count: int) -> None:
     """Limit this process and its child processes to `count` threads.
 
-    Records hold the number of threads: call this before planning.
+    Records hold the number of threads, so call this before `build_plan`.
     """
     import cv2
     import torch

@@ -1,12 +1,14 @@
-"""Aachen Day-Night, versions 1 and 1.1, as downloaded (Sattler et al., CVPR 2018; Zhang et al., IJCV 2020), and for its server.
+"""Aachen Day-Night, versions 1 and 1.1, in the layout of the download, and results for its evaluation server.
+
+Sources: Sattler et al., CVPR 2018; Zhang et al., IJCV 2020. The folder contains
 
     images/images_upright/ or images_upright/   references and queries
     3D-models/                                  v1: aachen_cvpr2018_db.nvm, here or in aachen_v_1/, with database_intrinsics.txt;
                                                 v1.1: aachen_v_1_1/, a COLMAP model, or an NVM with database_intrinsics_v1_1.txt
     queries/{day,night}_time_queries_with_intrinsics*.txt
 
-The poses of its queries are withheld. A file ground_truth.txt, which the download does not have, is read if it exists: the
-gallery is exported in this layout too.
+The poses of its queries are withheld. A file ground_truth.txt is read if it exists. The download has none, but the gallery can be
+exported in this layout, too.
 """
 
 from __future__ import annotations
@@ -40,7 +42,7 @@ VERSION_1_1 = re.compile(r"v?1[._]1\.txt$")  # the end of the name of a list of 
 
 @dataclass(frozen=True, kw_only=True)
 class Aachen(Dataset):
-    """Aachen Day-Night as downloaded."""
+    """Aachen Day-Night, in the layout of the download."""
 
     path: Path
     version: Version | None = None  # required if the folder holds both
@@ -50,14 +52,15 @@ class Aachen(Dataset):
 
 
 def load(root: Path, version: Version | None = None) -> Scene:
-    """Read the download.
+    """Return the scene of the download.
 
-    `version` selects one if the folder holds both. A condition's only list of queries is used for either version.
+    If the folder holds both versions, `version` selects one. If a condition has only one list of queries, it is used for either
+    version.
 
     Raises
     ------
     UserError
-        naming file and line, if something is missing, damaged, or ambiguous without a version.
+        if a part is missing or damaged, or `version` is needed; the message names file and line.
     """
     if not root.is_dir():
         raise UserError(f"{root}: no such folder")
@@ -79,16 +82,16 @@ def write_evaluation(folder: Path, method: str, poses: Mapping[str, pycolmap.Rig
 
     Parameters
     ----------
-    poses : camera from world of each query, by its name; None if it was not localized: such queries are left out
+    poses : camera from world of each query, by name; None for queries that were not localized, which are left out
 
     Returns
     -------
-    The file, and the number of queries left out.
+    The path of the file, and the number of queries left out.
 
     Raises
     ------
     UserError
-        if the method's name cannot be part of a file name, or two queries have one basename.
+        if the method's name cannot be part of a file name, or two queries have the same basename.
     """
     if not re.fullmatch(r"[\w.+-]+", method):
         raise UserError(f"method {method!r}: use only letters, digits and . _ + -")
@@ -126,7 +129,7 @@ def _is_model(path: Path) -> bool:
 
 
 def _read_nvm(path: Path) -> dict[str, PosedImage]:
-    """Read the NVM's poses with the intrinsics beside it."""
+    """Return the poses of an NVM file with the intrinsics beside it."""
     beside = sorted(path.parent.glob(INTRINSICS))
     if len(beside) != 1:
         raise UserError(f"{path.parent}: {len(beside)} files {INTRINSICS} beside {path.name}; expected one")
@@ -141,7 +144,7 @@ def _read_nvm(path: Path) -> dict[str, PosedImage]:
 
 
 def _find_query_list(root: Path, condition: Condition, version: Version | None) -> Path:
-    """Find the list of queries of that condition and version."""
+    """Return the path of the list of queries of that condition and version."""
     folder, pattern = root / "queries", QUERIES.format(condition)
     candidates = sorted(folder.glob(pattern))
     if not candidates:

@@ -1,8 +1,8 @@
 """A folder of photographs of one scene by one camera; structure from motion gives the poses.
 
-The poses, from raw descriptors of all photographs, are the ground truth, as for Aachen. By default every fifth photograph is a
-query. Queries have no part in the map or the dictionary, which are built from references alone. Structure from motion leaves the
-unit of length open. The distance of two cameras fixes it: by default those of the first photograph by name and of the middle one.
+The ground truth are poses from raw descriptors of all photographs, as for Aachen. By default every fifth photograph is a query.
+The map and the dictionary are built from references alone. Structure from motion does not determine the unit of length. The
+distance of two cameras defines it: by default those of the first photograph by name and of the middle one.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ class Captured(Dataset):
     """Photographs of one scene by one camera; poses come from structure from motion, and are cached."""
 
     path: Path
-    held_out: int = 5  # one photograph in this many is a query,
-    leading: int = 0  # or, unless 0, the first so many by name: consecutive ones, for structure from motion
-    first: str | None = None  # the two photographs whose cameras fix the unit of length
+    held_out: int = 5  # every photograph whose index is a multiple of this is a query
+    leading: int = 0  # if not 0, the first `leading` photographs by name are the queries instead, for structure from motion
+    first: str | None = None  # first and second: the photographs whose cameras define the unit of length
     second: str | None = None
-    length: float = 1.0  # of the distance between them
+    length: float = 1.0  # distance between the two cameras
 
     def __post_init__(self) -> None:
         if self.held_out < 2:
@@ -73,7 +73,7 @@ class Captured(Dataset):
 
 
 def _load_model(directory: Path, sources: list[Source]) -> Path:
-    """Return the folder with the cached model of these photographs; build it if it is missing."""
+    """Return the folder with the cached model of these photographs. A missing model is built."""
     import pycolmap
 
     def build(path: Path) -> None:
@@ -89,13 +89,13 @@ def _load_model(directory: Path, sources: list[Source]) -> Path:
 
 
 def _run_structure_from_motion(directory: Path, names: list[str], scratch: Path) -> pycolmap.Reconstruction:
-    """Run COLMAP's own pipeline with its default SIFT and one camera for all; return the largest model."""
+    """Run COLMAP's pipeline with its default SIFT and one camera for all images, and return the largest model."""
     import pycolmap
 
     database = scratch / "database.db"
     pycolmap.extract_features(database, directory, image_names=names, camera_mode=pycolmap.CameraMode.SINGLE)
     pycolmap.match_exhaustive(database)
-    # One thread and a seed: with more threads the order of summation varies.
+    # One thread and a seed, since the order of summation varies with more threads.
     options = pycolmap.IncrementalPipelineOptions(random_seed=0, num_threads=1)
     models = pycolmap.incremental_mapping(database, directory, scratch, options)
     if not models:
@@ -106,11 +106,11 @@ def _run_structure_from_motion(directory: Path, names: list[str], scratch: Path)
 def _measure_distance(posed: dict[str, PosedImage], first: str, second: str) -> float:
     for name in (first, second):
         if name not in posed:
-            raise UserError(f"captured: {name}, which fixes the unit of length, has no pose; name another (first=, second=)")
+            raise UserError(f"captured: {name}, which defines the unit of length, has no pose; give another (first=, second=)")
     a, b = (posed[name][2].inverse().translation for name in (first, second))
     distance = float(np.linalg.norm(a - b))
     if distance == 0:
-        raise UserError(f"captured: {first} and {second} have the same position, which fixes no unit of length; name others")
+        raise UserError(f"captured: {first} and {second} have the same position, which defines no unit of length; give others")
     return distance
 
 

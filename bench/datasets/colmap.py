@@ -1,6 +1,6 @@
-"""Any COLMAP model as a scene: its images are the references; lists with intrinsics name the queries.
+"""Any COLMAP model as a scene. Its images are the references; lists with names and intrinsics define the queries.
 
-The folder holds
+The folder contains
 
     images/                                     references and queries
     sparse/ or sparse/0/                        the model, as text or binary
@@ -41,12 +41,12 @@ class Colmap(Dataset):
 
 
 def load(root: Path) -> Scene:
-    """Read a folder in the layout above.
+    """Return the scene in a folder of the layout above.
 
     Raises
     ------
     UserError
-        naming file and line, if something is missing or damaged.
+        if a part is missing or damaged; the message names file and line.
     """
     if not root.is_dir():
         raise UserError(f"{root}: no such folder")
@@ -68,7 +68,7 @@ def load(root: Path) -> Scene:
 
 
 def find_ground_truth(root: Path) -> Path | None:
-    """Find the file or folder with the poses of the queries; None if there is none."""
+    """Return the file or folder with the poses of the queries; None if there is none."""
     return next((path for path in (root / "ground_truth.txt", root / "ground_truth") if path.exists()), None)
 
 
@@ -84,12 +84,13 @@ def assemble(
     ground_truth: Path | None = None,
     masks: Path | None = None,
 ) -> Scene:
-    """Assemble a scene from references, lists of queries and the folder of all images.
+    """Return the scene of given references, lists of queries, and the folder of all images.
 
     Raises
     ------
     UserError
-        naming file and line, if a list is damaged, an image is missing, a name is used twice, or a pose belongs to no query.
+        if a list is damaged, an image is missing, a name is used twice, or a pose belongs to no query. The message names file and
+        line.
     """
     poses = {} if ground_truth is None else _read_poses(ground_truth)
     reference_images = [
@@ -108,17 +109,17 @@ def assemble(
             query_images[query] = SceneImage(name=query, camera=camera, cam_from_world=pose, condition=condition, pixels=pixels)
     if poses:
         stray, (where, _) = next(iter(poses.items()))
-        raise UserError(f"{where}: a pose of {stray}, which is no query")
+        raise UserError(f"{where}: {stray} has a pose but is no query; add it to a list of queries, or remove the pose")
     return Scene(name=name, references=tuple(reference_images), queries=tuple(query_images.values()))
 
 
 def read_model(folder: Path) -> dict[str, PosedImage]:
-    """Read the images of a COLMAP model that have a pose.
+    """Return the images of a COLMAP model that have a pose, by name.
 
     Raises
     ------
     UserError
-        naming file and, for text, line, if the model is damaged or holds no pose.
+        if the model is damaged or contains no pose; the message names the file and, for text, the line.
     """
     import pycolmap
 
@@ -149,7 +150,7 @@ def is_model(folder: Path) -> bool:
 
 
 def _check_text(folder: Path) -> dict[str, str]:
-    """Check what pycolmap would accept, or reject without a file and line. -> each image's file and line"""
+    """Check faults that pycolmap accepts, or reports without file and line. -> name of an image: its file and line"""
     cameras = set()
     for number, fields in lists.read_fields(folder / "cameras.txt"):
         lists.parse_camera(fields[1:], f"{folder / 'cameras.txt'}:{number}")

@@ -1,7 +1,7 @@
-"""A stretch of a walk through the gallery's courtyard: views close to each other, for structure from motion.
+"""A part of a walk through the gallery's courtyard, with small distances between views, for structure from motion.
 
-The queries are consecutive views of the second lap, which looks across the courtyard, without people. The references, for the
-dictionary, are views of both laps outside the stretch.
+The queries are consecutive views of the second lap, which looks across the courtyard, without people. The references, which serve
+the dictionary, are views of both laps outside that part.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ class Walk(Dataset):
     """Consecutive views of a walk through a synthetic courtyard, rendered on demand; poses are exact and in metres."""
 
     seed: int = 0
-    views: int = 25  # of the stretch
-    others: int = 150  # references: views of the courtyard outside the stretch
-    start: float = 0.3  # of the stretch, as a fraction of the lap
-    steps: int = 340  # views of a lap
+    views: int = 25  # number of queries
+    others: int = 150  # number of references, views of the courtyard outside that part
+    start: float = 0.3  # of that part, as a fraction of the lap
+    steps: int = 340  # number of views of a lap
     width: int = 640  # pixels
     height: int = 480
     detail: float = 1.0  # of textures and light; 1 is about a texel a pixel from 1.5 m away
@@ -46,7 +46,7 @@ class Walk(Dataset):
             height=self.height,
             detail=self.detail,
         )
-        images = gallery.scene().references  # one lap after the other
+        images = gallery.scene().references  # the first lap, then the second
         first = self.steps + round(self.start * (self.steps - self.views))
         stretch = range(first, first + self.views)
         rest = [index for index in range(len(images)) if index not in stretch]

@@ -1,1 +1,1 @@
-"""Extractors, one file each, which sets `PLUGIN`."""
+"""Extractors: one file each, which assigns `PLUGIN`."""

@@ -1,7 +1,7 @@
-"""Features that COLMAP extracted, read from its database through pycolmap.
+"""Features that COLMAP extracted, read from its database by pycolmap.
 
-COLMAP puts the centre of the first pixel at (0.5, 0.5), as we do. Descriptors are its 8-bit ones. An image's name in the database
-is its path below COLMAP's image folder.
+COLMAP puts the centre of the first pixel at (0.5, 0.5), as we do. Its descriptors have 8 bits. The name of an image in the
+database is its path below COLMAP's image folder.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class ColmapDatabase(Extractor):
     eight_bit = True
 
     path: Path
-    exact_zeros: bool = False  # whether many components are exactly zero, as of SIFT
+    exact_zeros: bool = False  # whether many components are exactly zero, as in SIFT
 
     def __post_init__(self) -> None:
         if not self.path.is_file():
@@ -38,7 +38,7 @@ class ColmapDatabase(Extractor):
         import pycolmap
 
         if source is None:
-            raise UserError("colmap-database: features are looked up by the photograph's file, and this one has none")
+            raise UserError("colmap-database: features are found by the photograph's file, but this image has none")
         numbers = _list_images(self.path, self.path.stat().st_mtime_ns)
         name = match_name(source, numbers)
         if name is None:

@@ -1,7 +1,7 @@
 """HardNet descriptors (Mishchuk et al., NeurIPS 2017) of upright SIFT keypoints, through kornia (`pip install kornia`).
 
-Nothing is downloaded. The weights are kornia's `checkpoint_liberty_with_aug.pth`: a given file, or the copy that torch.hub stores
-(`torch.hub.get_dir()`/checkpoints) on the first call of `kornia.feature.HardNet(pretrained=True)`.
+Nothing is downloaded. The weights are kornia's `checkpoint_liberty_with_aug.pth`: a given file, or torch.hub's copy in the folder
+`torch.hub.get_dir()`/checkpoints. The first call of `kornia.feature.HardNet(pretrained=True)` stores that copy.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from bench.types import Features, Floats
 
 HUB = Path("hub")
 WEIGHTS = "checkpoint_liberty_with_aug.pth"
-RADIUS = 3.0  # of a patch, in diameters of a keypoint: six standard deviations, as of SIFT's own window and in kornia
+RADIUS = 3.0  # of a patch, in diameters of a keypoint: six standard deviations, as in SIFT's own window and in kornia
 BATCH = 256  # patches
 
 
@@ -30,8 +30,8 @@ BATCH = 256  # patches
 class HardNet(Extractor):
     """HardNet at upright SIFT's keypoints."""
 
-    weights: Path  # kornia's file, or `hub` for torch.hub's copy; records hold the content's digest
-    max_keypoints: int = 1000  # those of strongest response
+    weights: Path  # kornia's file, or `hub` for torch.hub's copy; records hold the digest of the content
+    max_keypoints: int = 1000  # the keypoints with the strongest response
 
     def __post_init__(self) -> None:
         if self.weights == HUB:

@@ -1,8 +1,8 @@
-"""Features that hloc extracted (Sarlin et al., CVPR 2019): an HDF5 file with a group for each image.
+"""Features that hloc extracted (Sarlin et al., CVPR 2019), read from an HDF5 file with a group for each image.
 
-A group is named by the image's path below hloc's image folder, and holds `keypoints` (N, 2), `descriptors` (D, N) and
-`image_size` (width, height). hloc puts the centre of the first pixel at (0, 0), so half a pixel is added; and it reads images
-without their EXIF rotation, so a rotated photograph is refused.
+The name of a group is the image's path below hloc's image folder. A group holds `keypoints` (N, 2), `descriptors` (D, N) and
+`image_size` (width, height). hloc puts the centre of the first pixel at (0, 0), so half a pixel is added. hloc ignores EXIF
+rotation, so a photograph with an EXIF rotation is refused.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ class Hloc(Extractor):
 
     path: Path
     dimension: int = 128  # of a descriptor
-    exact_zeros: bool = False  # whether none is negative and many components are exactly zero, as of SIFT and RootSIFT
-    eight_bit: bool = False  # whether each is an 8-bit integer vector, scaled
+    exact_zeros: bool = False  # whether no component is negative and many are exactly zero, as in SIFT and RootSIFT
+    eight_bit: bool = False  # whether each descriptor is an 8-bit integer vector, scaled
 
     def __post_init__(self) -> None:
         import h5py
@@ -38,7 +38,7 @@ class Hloc(Extractor):
 
     def extract(self, image: np.ndarray, source: Path | None = None) -> Features:
         if source is None:
-            raise UserError("hloc: features are looked up by the photograph's file, and this one has none")
+            raise UserError("hloc: features are found by the photograph's file, but this image has none")
         keypoints, stored, size = self._read(source)
         _check(source, stored, len(keypoints), self.dimension, size)
         descriptors = stored.T  # (N, D)

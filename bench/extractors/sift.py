@@ -17,10 +17,10 @@ from bench.types import Features, Indices
 
 @dataclass(frozen=True, kw_only=True)
 class Sift(Extractor):
-    """SIFT; upright by default: one orientation, gravity's, and each point once.
+    """SIFT; upright by default: one orientation, that of gravity, and each point once.
 
-    Orientation is never released. An upright descriptor reveals the direction of its edges. For an oriented one
-    (`upright=false`, the paper's) the attacker must infer it.
+    The orientation is never released. An upright descriptor reveals the direction of its edges. With an oriented descriptor
+    (`upright=false`, as in the paper) the attacker must infer the direction.
     """
 
     exact_zeros = True
@@ -29,7 +29,7 @@ class Sift(Extractor):
     upright: bool = True
     contrast_threshold: float = 0.002  # lower than OpenCV's .04: about 600 to 1,000 keypoints for 256 x 256 pixels
     edge_threshold: float = 15.0
-    max_keypoints: int = 1000  # those of strongest response
+    max_keypoints: int = 1000  # the keypoints with the strongest response
 
     def __post_init__(self) -> None:
         if self.contrast_threshold < 0 or self.edge_threshold <= 0 or self.max_keypoints < 1:
@@ -45,13 +45,13 @@ class Sift(Extractor):
         points = sift.detect(grey, None)
         if self.upright:
             points = _deduplicate(points)
-        # Strongest first; equal responses in the order of their positions, so that the cut is reproducible.
+        # Strongest first, equal responses by position, so that the selection is reproducible.
         points = sorted(points, key=lambda p: (-p.response, p.pt, p.size, p.angle))[: self.max_keypoints]
         if not points:
             raise SampleError("no keypoint was found: is the image flat?")
         points, values = sift.compute(grey, points)
         codes = values.astype(np.uint8)  # OpenCV rounds to 0..255 and returns float32
-        xy = np.array([point.pt for point in points], dtype=np.float32) + 0.5  # OpenCV's centre of the first pixel is 0
+        xy = np.array([point.pt for point in points], dtype=np.float32) + 0.5  # OpenCV puts the centre of the first pixel at 0
         frames = np.array([(point.size, math.radians(point.angle)) for point in points], dtype=np.float32)  # (N, 2)
         keep = codes.any(axis=1)
         height, width = grey.shape
@@ -61,7 +61,11 @@ class Sift(Extractor):
         return features.by_position()
 
     def mirror_order(self) -> Indices:
-        """Upright: the columns of the 4 x 4 histograms are reversed, and angle a becomes π - a. Oriented: rows, and -a."""
+        """Return the permutation for the mirrored photograph.
+
+        Upright: the columns of the 4 x 4 histograms are reversed, and angle a becomes π - a. Oriented: the rows are reversed, and
+        a becomes -a.
+        """
         row, column, angle = np.indices((4, 4, 8))
         if self.upright:
             column, angle = 3 - column, (4 - angle) % 8
@@ -71,7 +75,10 @@ class Sift(Extractor):
         return order
 
     def turn_order(self) -> Indices:
-        """Upright: columns of the histograms become rows from below, and angle a becomes a + π / 2. Oriented: unchanged."""
+        """Return the permutation for the photograph turned by 90 degrees counter-clockwise.
+
+        Upright: the columns of the histograms become rows from below, and angle a becomes a + π / 2. Oriented: unchanged.
+        """
         row, column, angle = np.indices((4, 4, 8))
         if self.upright:
             row, column, angle = column, 3 - row, (angle - 2) % 8
@@ -83,7 +90,7 @@ class Sift(Extractor):
 
 
 def _deduplicate(points: list) -> list:
-    """Drop points that differ in orientation only, and set the orientation to 0."""
+    """Return one of the points that differ in orientation only, and set all orientations to 0."""
     unique = {(point.pt, point.size): point for point in points}
     for point in unique.values():
         point.angle = 0.0

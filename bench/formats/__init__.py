@@ -1,1 +1,1 @@
-"""Readers and writers of files that other programs use."""
+"""Readers and writers of file formats of other programs."""

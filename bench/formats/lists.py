@@ -1,4 +1,4 @@
-"""Reads and writes text files of intrinsics and poses, as localization benchmarks use them. Errors name file and line.
+"""Text files of intrinsics and poses, in the formats of localization benchmarks. Errors name file and line.
 
 Intrinsics: `name MODEL width height params...`, with the models and parameters of COLMAP.
 Poses: `name qw qx qy qz tx ty tz`, world to camera. Empty lines and lines that begin with # are ignored.
@@ -54,17 +54,17 @@ def write_intrinsics(path: Path, cameras: Mapping[str, pycolmap.Camera]) -> None
 
 
 def write_poses(path: Path, poses: Mapping[str, pycolmap.Rigid3d]) -> None:
-    """Write poses. Reading returns the same doubles."""
+    """Write poses. `read_poses` returns the same doubles."""
     _write_lines(path, (f"{name} {_format_numbers([*to_wxyz(pose), *pose.translation])}" for name, pose in poses.items()))
 
 
 def to_wxyz(cam_from_world: pycolmap.Rigid3d) -> np.ndarray:
-    """Return the rotation as w x y z. -> (4,)"""
+    """Return the rotation as a quaternion w x y z. -> (4,)"""
     return np.roll(cam_from_world.rotation.quat, 1)
 
 
 def read_fields(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Yield the number and the fields of each line that is neither empty nor a comment. Reads lazily: models are large.
+    """Yield the number and the fields of each line that is neither empty nor a comment, while reading the file.
 
     Raises
     ------

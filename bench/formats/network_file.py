@@ -1,4 +1,4 @@
-"""A network as it was read from a file: its tensors and metadata, from which the module is built at first use."""
+"""A network that was read from a file: its tensors and metadata, and the module, which is built at first use."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class NetworkFile(ABC):
     @property
     @abstractmethod
     def module(self) -> nn.Module:
-        """The network itself; UserError if its tensors do not match its metadata."""
+        """The module. Raises UserError if its tensors do not match its metadata."""
 
     def verify(self) -> str:
         """Compare the tensors with the metadata, and return the digest.

@@ -1,8 +1,8 @@
-"""Reads and writes the cameras of VisualSFM's models (NVM_V3). Points are not read: they are triangulated again.
+"""Cameras of VisualSFM's models (NVM_V3). Points are not read, since they are triangulated again.
 
-After the header and the number of cameras, each camera is a line `name focal qw qx qy qz cx cy cz distortion 0`: the rotation
-from world to camera, and the camera's centre in the world. The focal length and distortion are not used: Aachen's notes
-say that the intrinsics beside the model are the right ones.
+A header and the number of cameras come first. Then each camera is a line `name focal qw qx qy qz cx cy cz distortion 0`. The
+quaternion is the rotation from world to camera, and cx cy cz is the camera's centre in the world. The focal length and the
+distortion are not used: according to Aachen's notes, the intrinsics beside the model are the right ones.
 """
 
 from __future__ import annotations

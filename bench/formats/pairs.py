@@ -1,4 +1,4 @@
-"""Reads and writes hloc's lists of image pairs: one line `query reference` for each pair, the best reference first."""
+"""Lists of image pairs in hloc's format: one line `query reference` for each pair, the best reference first."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def read(path: Path) -> dict[str, list[str]]:
     Raises
     ------
     UserError
-        naming file and line, if a line is not a pair or occurs twice, or there is no pair.
+        if a line is not a pair, a pair occurs twice, or there is no pair; the message names file and line.
     """
     pairs: dict[str, list[str]] = {}
     for number, fields in lists.read_fields(path):
@@ -37,7 +37,7 @@ def write(path: Path, pairs: Mapping[str, Sequence[str]]) -> int:
     Raises
     ------
     UserError
-        if a name contains a space: the file could not be read.
+        if a name contains a space, since the file could not be read.
     """
     rows = [(query, reference) for query, references in pairs.items() for reference in references]
     for name in {*pairs, *(reference for _, reference in rows)}:
@@ -49,5 +49,5 @@ def write(path: Path, pairs: Mapping[str, Sequence[str]]) -> int:
 
 
 def pair_all(names: Sequence[str]) -> dict[str, Sequence[str]]:
-    """Return every pair of names once, as `write` takes them."""
+    """Return every pair of names once, in the form of `write`."""
     return {name: names[index + 1 :] for index, name in enumerate(names)}

@@ -1,6 +1,6 @@
-"""Writes a scene to disk in the layouts that `bench.datasets.aachen` and `bench.datasets.colmap` read.
+"""Export of a scene to the layouts that `bench.datasets.aachen` and `bench.datasets.colmap` read.
 
-Images are PNG, so no pixel changes. Foreground masks and ground truth are written too, if known.
+Images are written as PNG, so no pixel changes. Foreground masks and ground truth are written, too, if they are known.
 """
 
 from __future__ import annotations

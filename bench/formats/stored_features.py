@@ -1,6 +1,6 @@
-"""Maps keypoints between a photograph as stored and the benchmark's square, for features from other programs.
+"""Coordinates of features from other programs: conversion between the stored photograph and the benchmark's square.
 
-A photograph's name in such a file is its path below the other program's image folder.
+The name of a photograph in a file of features is its path below the other program's image folder.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ def map_out_of_square(xy: np.ndarray, size: tuple[int, int], side: int) -> np.nd
 
 
 def match_name(source: Path, names: Container[str]) -> str | None:
-    """Return the longest end of a photograph's path that is in `names`, None if there is none."""
+    """Return the longest suffix of a photograph's path that is in `names`; None if there is none."""
     parts = source.resolve().parts[1:]
     ends = ("/".join(parts[start:]) for start in range(len(parts)))
     return next((end for end in ends if end in names), None)
 
 
 def read_upright_size(source: Path, size: tuple[int, int] | None = None) -> tuple[int, int]:
-    """Return the width and height of a photograph as stored, and check that they are `size` if given.
+    """Return the width and height of the stored photograph, and check that they equal `size`, if given.
 
     Raises
     ------
     SampleError
-        if it has another size, or an EXIF rotation, which features of other programs ignore.
+        if the photograph has another size, or an EXIF rotation, which features of other programs ignore.
     """
     try:
         with Image.open(source) as opened:
@@ -47,7 +47,7 @@ def read_upright_size(source: Path, size: tuple[int, int] | None = None) -> tupl
                 sizes = f"the features are of an image of {size} pixels, the photograph has {opened.size}"
                 raise SampleError(f"{source.name}: {sizes}")
             if opened.getexif().get(ORIENTATION, 1) != 1:
-                raise SampleError(f"{source.name}: it has an EXIF rotation, which such features ignore")
+                raise SampleError(f"{source.name}: it has an EXIF rotation, which features of other programs ignore")
             return opened.size
     except OSError as error:
         raise SampleError(f"{source.name}: cannot be read as an image: {error}") from error

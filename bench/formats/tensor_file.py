@@ -26,14 +26,14 @@ def hash_content(kind: str, arrays: Arrays, meta: dict[str, Any]) -> str:
 
 
 def to_half(array: np.ndarray) -> np.ndarray:
-    """Convert to half precision, unless a value overflows: a batch norm's variance may be above 65,504."""
+    """Return the array in half precision, or unchanged if a value overflows: a batch norm's variance may be above 65,504."""
     with np.errstate(over="ignore"):
         half = array.astype(np.float16)
     return half if np.isfinite(half).all() else array
 
 
 def save(path: Path, kind: str, arrays: Arrays, meta: dict[str, Any]) -> str:
-    """Write the file atomically (a crash leaves the old one) and return its digest."""
+    """Write the file atomically, so that a crash leaves the old file, and return its digest."""
     from safetensors.numpy import save as serialize
 
     digest = hash_content(kind, arrays, meta)
@@ -56,7 +56,7 @@ def load(path: Path, kind: str) -> tuple[Arrays, dict[str, Any], str]:
     Raises
     ------
     UserError
-        if there is no such file, it is of another kind, or its digest is wrong.
+        if there is no such file, its kind differs, or its digest is wrong.
     """
     arrays, header = _read(path)
     if header.get("kind") != kind:

@@ -1,4 +1,4 @@
-"""Database reconstruction from releases alone: subspaces that share a word intersect in it, an exact 8-bit vector."""
+"""Database reconstruction from releases alone: subspaces with a common word intersect in it, and it is an 8-bit vector."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from bench.types import Bytes
 Doubles = NDArray[np.float64]
 
 NORM = 512.0  # approximate norm of 8-bit descriptors
-INTEGER_TOLERANCE = 0.01  # a number this near to an integer is one; float32 releases are off by 1e-4 of the last bit
+INTEGER_TOLERANCE = 0.01  # a number this near to an integer counts as an integer; float32 releases err by 1e-4 of the last bit
 
 
 def reconstruct_database(intersections: SubspaceIntersections) -> Bytes:
@@ -25,7 +25,7 @@ def reconstruct_database(intersections: SubspaceIntersections) -> Bytes:
 def find_byte_vectors(points: Doubles) -> Bytes:
     """Return the shortest 8-bit vector in the direction of each point; points without one are left out. (P, D) -> (P', D)
 
-    The greatest component is an integer from 1 to 255, so there are 255 lengths to try.
+    The greatest component is an integer from 1 to 255, so 255 lengths are tried.
     """
     vectors = [np.empty((0, points.shape[1]), dtype=np.uint8)]
     directions = points / points.max(axis=1, initial=0.0, keepdims=True).clip(min=1e-9)  # (P, D) the greatest component is 1

@@ -1,6 +1,6 @@
-"""Squared distances of all pairs of points and affine subspaces, and mutual nearest neighbours.
+"""Squared distances of all pairs of points and affine subspaces, in float32, and mutual nearest neighbours.
 
-In float32. The error is about 1e-6 for points of unit norm and subspaces, and about 2e-5 for two subspaces.
+The error is about 1e-6 for points of unit norm and subspaces, and about 2e-5 for two subspaces.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 
 
 def points_to_points(one: Tensor, other: Tensor) -> Tensor:
-    """Squared distances of unit vectors. (N, D), (R, D) -> (N, R)"""
+    """Return the squared distances of unit vectors. (N, D), (R, D) -> (N, R)"""
     return (2 - 2 * (one @ other.T)).clamp_(min=0)
 
 
 def subspaces_to_points(release: Subspaces, points: Tensor) -> Tensor:
-    """Squared distances of subspaces and unit vectors u. (R, D) -> (N, R)
+    """Return the squared distances of subspaces and unit vectors u. (R, D) -> (N, R)
 
-    1 + |p|² − 2 p·u − |B u|², where p is the subspace's point nearest to zero.
+    dist² = 1 + |p|² − 2 p·u − |B u|², where p is the subspace's point nearest to zero.
     """
     import torch
 
@@ -40,7 +40,7 @@ def subspaces_to_points(release: Subspaces, points: Tensor) -> Tensor:
 
 
 def subspaces_to_subspaces(one: Subspaces, other: Subspaces) -> Tensor:
-    """Squared distances of subspaces. -> (N, N')"""
+    """Return the squared distances of subspaces. -> (N, N')"""
     import torch
 
     squared = torch.empty(len(one), len(other), device=pick_device())

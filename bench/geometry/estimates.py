@@ -10,14 +10,15 @@ from bench.geometry.subspaces import Doubles, project
 from bench.types import Bytes, Floats, Indices, Subspaces
 
 BATCH_WORDS = 65_536  # words per batch
-MIN_DISTANCE = 1e-12  # smaller distances to D count as this one, which outweighs every other word
+MIN_DISTANCE = 1e-12  # replaces smaller distances to D; such a word outweighs all others
 
 
 def estimate(release: Subspaces, words: Bytes, found: Indices, distances: Doubles, adversarial: int, estimators: int) -> Floats:
     """Return d̂ of each subspace: the mean of words near it and far from its adversarial ones, projected onto it.
 
-    The adversarial words are the first ones that lie in D, at most `adversarial`. Where some are not among `words`, the others
-    represent them. Of the remaining words, the `estimators` farthest from the adversarial ones are averaged with 1 / dist(D, u).
+    The adversarial words are the first words that lie in D, at most `adversarial`. If some of them are not among `words`, the
+    others represent them. Of the remaining words, the `estimators` words farthest from the adversarial ones are averaged with
+    weights 1 / dist(D, u).
 
     Parameters
     ----------
@@ -35,7 +36,7 @@ def estimate(release: Subspaces, words: Bytes, found: Indices, distances: Double
         rows = unit_rows(words[found[batch]])  # (n, adversarial + |V|, D)
         inside = distances[batch, :adversarial] < INTERSECTION_DISTANCE  # (n, adversarial)
         cosines = rows @ rows[:, :adversarial].transpose(0, 2, 1)  # (n, adversarial + |V|, adversarial)
-        # The greater the cosine, the shorter min_j |â_j − v|. An â itself comes last.
+        # A greater cosine means a smaller min_j |â_j − v|. The â themselves come last.
         closeness = np.where(inside[:, None], cosines, -np.inf).max(axis=2)
         closeness[:, :adversarial][inside] = np.inf
         selection = np.argsort(closeness, axis=1, kind="stable")[:, :estimators]  # (n, |U|)

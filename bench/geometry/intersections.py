@@ -1,11 +1,11 @@
-"""Intersections of affine subspaces: two that contain the same descriptor have distance zero and intersect in it.
+"""Intersections of affine subspaces: two subspaces with a common descriptor have distance zero and intersect in it.
 
 For D1 = {o1 + B1ᵀ c1} and D2 = {o2 + B2ᵀ c2} with orthonormal bases, put δ = o2 − o1 and G = B1 [B2ᵀ, δ]. The least squares over
 c1 leave the quadratic form S = [[I, B2 δ], [(B2 δ)ᵀ, |δ|²]] − Gᵀ G of (c2, 1); eliminating c2 from it leaves dist(D1, D2)².
 
 All pairs are screened in float32 after a projection onto dim + dim' + 16 fixed directions. A projection increases no distance, so
 intersecting pairs still intersect. Other pairs stay apart in the 16 extra directions. The remaining pairs are decided in float64
-and in all dimensions: float32 releases of one descriptor come within about 1e-7, other pairs keep a distance of a tenth or more.
+and in all dimensions. Float32 releases of one descriptor have a distance of about 1e-7, other pairs of a tenth or more.
 
 Floor, for a pair of equal dimensions: 2 (dim + 1)² (2 dim + 16) operations of a matrix product, dim (dim + 1)² + (dim + 1)³ / 3
 multiply-adds of the elimination. The latter take most of the time; pairs are contiguous in memory, so each step is a long loop.
@@ -33,9 +33,9 @@ Doubles = NDArray[np.float64]
 INTERSECTION_DISTANCE = 1e-5  # below this distance two subspaces intersect
 SPARE_DIRECTIONS = 16  # directions beyond those that two subspaces span
 NEAR = 4e-4  # greatest squared distance that passes the screening; its error is about 2e-5 for points of unit norm
-SINGULAR = 1e-9  # squared sine below which two directions are one; with bases orthonormal to 1e-14, shared ones have about 1e-13
+SINGULAR = 1e-9  # squared sine below which two directions are equal; common ones have about 1e-13 in bases orthonormal to 1e-14
 PIVOT = 1e-6  # least divisor, for pairs that share a direction
-BLOCK = 600_000  # numbers in the quadratic forms of a block of pairs, so that they stay in the cache
+BLOCK = 600_000  # numbers in the quadratic forms of a block of pairs, which then fit into the cache
 ROWS = 8  # subspaces of the first side in a block
 EXACT = 1024  # pairs decided at a time
 
@@ -47,7 +47,7 @@ class SubspaceIntersections:
     first: Indices  # (P,) rows of the first release
     second: Indices  # (P,) rows of the second release
     points: Doubles  # (P, D) midpoints of the nearest points of the two
-    single: NDArray[np.bool_]  # (P,) whether the intersection is that point and no line
+    single: NDArray[np.bool_]  # (P,) whether the intersection is a single point, not a line or more
 
     def __len__(self) -> int:
         return len(self.first)
@@ -97,7 +97,7 @@ def _screen_pairs(one: Subspaces, other: Subspaces, triangle: bool = False) -> I
 def squared_distances(
     one: Subspaces, other: Subspaces, directions: int, triangle: bool = False
 ) -> Iterator[tuple[int, int, Tensor]]:
-    """dist² of all pairs, block by block, after a projection onto `directions` fixed directions; D of them change nothing.
+    """Yield dist² of all pairs, block by block, after a projection onto `directions` fixed directions; D of them are exact.
 
     Returns
     -------
@@ -112,7 +112,7 @@ def squared_distances(
 
 
 def _project_subspaces(release: Subspaces, count: int) -> Tensor:
-    """Project each subspace onto `count` directions: orthonormal basis and point nearest to zero. -> (dim + 1, N, count)"""
+    """Return each subspace projected onto `count` directions: basis, then the point nearest to zero. -> (dim + 1, N, count)"""
     import torch
 
     onto = _draw_directions(release.origins.shape[1], count)  # (D, count)
@@ -124,12 +124,12 @@ def _project_subspaces(release: Subspaces, count: int) -> Tensor:
 
 @functools.cache
 def _draw_directions(length: int, count: int) -> Doubles:
-    """Draw orthonormal columns, at most `length`. Results do not depend on the draw. -> (length, count)"""
+    """Return random orthonormal columns, at most `length`. Results do not depend on the draw. -> (length, count)"""
     return np.linalg.qr(np.random.default_rng(0).normal(size=(length, min(length, count))))[0]
 
 
 def _compute_squared_distances(one: Tensor, other: Tensor) -> Tensor:
-    """dist² of all pairs. (a + 1, n, k), (b + 1, n', k) bases and, last, the points nearest to zero -> (n, n')
+    """Return dist² of all pairs. (a + 1, n, k), (b + 1, n', k) bases and, last, the points nearest to zero -> (n, n')
 
     Symmetric elimination. Entries above the diagonal of the form are never read.
     """
@@ -183,5 +183,5 @@ def find_nearest_points(one: Subspaces, other: Subspaces) -> tuple[Doubles, Doub
 
 
 def orthonormalize(bases: Doubles) -> Doubles:
-    """Improve bases that are orthonormal to 1e-7, as in float32, to 1e-14 by one Newton step. (N, dim, D)"""
+    """Return bases that are orthonormal to 1e-14, from bases to 1e-7 (float32), by one Newton step. (N, dim, D)"""
     return bases + (np.eye(bases.shape[1]) - bases @ bases.transpose(0, 2, 1)) @ bases / 2

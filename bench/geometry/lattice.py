@@ -1,13 +1,14 @@
 """Points of affine subspaces that are multiples of an integer vector, by lattice reduction (Lenstra, Lenstra, Lovász 1982).
 
-The linear span L of an affine subspace D has k = dim + 1 dimensions, and a random direction in it has no integer vector of
-moderate length. Given L to a part in 10^6, the existing ones can be found. k components y of x in L determine the others, x = M
-y. The rows of [I, λ M'], [0, λ I], with M' e rows of M, span a lattice in which the integer vectors of L are the short ones:
-about |x|, where a random lattice has λ^(e / (k + e)).
+The linear span L of an affine subspace D has k = dim + 1 dimensions. A random direction in L has no integer vector of moderate
+length. If L is given with a relative error of 10^-6, the existing integer vectors can be found, as follows. k components y of a
+vector x in L determine the others: x = M y. Let M' be e rows of M. The rows of [I, λ M'] and [0, λ I] span a lattice. Integer
+vectors x of L are short vectors of this lattice, with a length of about |x|. A random lattice has a shortest length of about
+λ^(e / (k + e)).
 
-Such an x = f y, with y in D and f linear on L, is a multiple of a unit vector of D if |x| = f. All such x up to a length are
-enumerated (Fincke, Pohst 1985). In the form |x|² - β f², with β their mean cosine, they are nearly orthogonal: a basis that
-is reduced in that form often consists of them, and few combinations must be tried.
+Such a vector is x = f y, with y in D and f linear on L. It is a multiple of a unit vector of D if |x| = f. All such x up to a
+given length are enumerated (Fincke, Pohst 1985). In the form |x|² - β f², with β their mean cosine, they are nearly orthogonal.
+So a basis that is reduced in that form often consists of them, and few combinations must be tried.
 """
 
 from __future__ import annotations
@@ -26,13 +27,13 @@ Integers = NDArray[np.int64]
 
 BATCH = 256  # subspaces at a time
 WEIGHT = 1e6  # λ: float32 leaves errors of 1e-6 to 5e-5 in an integer vector's components
-INTEGRAL = 0.01  # a component this near to an integer counts as one
+INTEGRAL = 0.01  # a component this near to an integer counts as an integer
 MARGIN = 2.0  # factor by which random short vectors must be longer
-SLACK = 1.25  # a basis may need longer vectors than the searched ones
-ROUNDS = 4  # reductions, each with the components that stayed fractional in the previous one
-FINENESS = 64.0  # of the rounding grid of bases; rounding errors add up over k components of up to 255
+SLACK = 1.25  # factor by which vectors of a basis may be longer than the searched ones
+ROUNDS = 4  # number of reductions; each uses the components that were fractional after the previous one
+FINENESS = 64.0  # of the grid to which bases are rounded; rounding errors add up over k components of up to 255
 DEFINITE = 0.999  # of the greatest β for which |x|² - β f² is positive
-ON_SPHERE = 1e-6  # of ||x| - f| / |x|; float32 leaves 1e-7
+ON_SPHERE = 1e-6  # greatest ||x| - f| / |x|; float32 leaves 1e-7
 MAX_SHORT_VECTORS = 1e6  # expected number of short vectors above which a lattice is skipped
 
 
@@ -41,7 +42,7 @@ def find_unit_integer_points(release: Subspaces, longest: float) -> tuple[Indice
 
     Parameters
     ----------
-    release : in float32; half precision is not enough for WEIGHT
+    release : in float32; half precision is too coarse for WEIGHT
     longest : greatest norm of the integer vectors
 
     Returns
@@ -66,7 +67,7 @@ def find_unit_integer_points(release: Subspaces, longest: float) -> tuple[Indice
 
 
 def find_integer_vectors(spans: Doubles, longest: float) -> list[Integers]:
-    """Find bases of the integer vectors in linear subspaces. (N, D, k) orthonormal columns -> N arrays (q, D), q <= k
+    """Return bases of the integer vectors in linear subspaces. (N, D, k) orthonormal columns -> N arrays (q, D), q <= k
 
     A basis is complete if its vectors need not be longer than SLACK · longest. Each subspace is one call of FLINT: 0.03 ms at
     k = 3, 6 ms at k = 17.
@@ -117,7 +118,7 @@ def enumerate_short_vectors(grams: Doubles, bounds: Doubles) -> tuple[Indices, I
 
 
 def reduce_basis(basis: Doubles) -> Doubles:
-    """LLL-reduce the rows of a basis, rounded to multiples of 1 / FINENESS. (n, c) -> (n, c)"""
+    """Return the LLL-reduced rows of a basis, rounded to multiples of 1 / FINENESS. (n, c) -> (n, c)"""
     from flint import fmpz_mat
 
     rows, columns = basis.shape
@@ -140,7 +141,7 @@ def _solve_integer_lattice(m: Doubles, rows: Indices, longest: float) -> Integer
 
 
 def _reduce_to_short(y: Doubles, m: Doubles, bound: float) -> Doubles:
-    """Reduce the lattice spanned by y to vectors where M y is nearly integral and no longer than the bound. (r, k), (e, k)"""
+    """Return vectors of the lattice of y for which M y is nearly integral and no longer than the bound. (r, k), (e, k)"""
     (r, k), e = y.shape, len(m)
     basis = np.zeros((r + e, k + e))
     basis[:r, :k], basis[:r, k:], basis[r:, k:] = y, WEIGHT * (y @ m.T), WEIGHT * np.eye(e)
@@ -182,7 +183,7 @@ def _reduce_form(form: Doubles) -> Doubles:
 
 
 def _estimate_count(forms: Doubles, bounds: Doubles) -> Doubles:
-    """Estimate the number of vectors within `bounds`: the ball's volume over that of a lattice cell. (n, q, q), (n,) -> (n,)"""
+    """Return the expected number of vectors within `bounds`: ball volume / lattice cell volume. (n, q, q), (n,) -> (n,)"""
     rank = forms.shape[1]
     ball = rank / 2 * math.log(math.pi) - math.lgamma(rank / 2 + 1)
     return np.exp(ball + rank / 2 * np.log(bounds) - np.linalg.slogdet(forms)[1] / 2)

@@ -16,7 +16,7 @@ def validate_images(truth: Floats, estimate: Floats) -> tuple[Doubles, Doubles]:
     Raises
     ------
     ValueError
-        if they are anything else.
+        if shapes or values are invalid.
     """
     _check_same_shape(truth, estimate)
     if truth.ndim != 3 or truth.shape[2] != 3:
@@ -33,7 +33,7 @@ def validate_descriptors(truth: Floats, estimate: Floats) -> tuple[Doubles, Doub
     Raises
     ------
     ValueError
-        if they are anything else, or hold a NaN or an infinity.
+        if the shapes are invalid, or a number is not finite.
     """
     _check_same_shape(truth, estimate)
     if truth.ndim != 2 or len(truth) == 0:

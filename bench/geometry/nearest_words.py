@@ -1,6 +1,6 @@
 """Exact search for the word of greatest cosine: a bf16 pass finds the candidates, float64 decides among them.
 
-Floor: 2·N·K·D operations at the machine's bf16 matrix rate; the words are read once for each batch of queries.
+Floor: 2·N·K·D operations at the machine's bf16 matrix rate. The words are read once per batch of queries.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
-BLOCK = 2048  # words in a block: a block and its scores stay in the cache
+BLOCK = 2048  # words in a block, which fits into the cache with its scores
 BATCH = 512  # queries per pass over the words
 
 SLACK = 1e-4  # for sums in float32 and for products of errors
 
 
 def unit_rows(rows: Bytes | Floats) -> Floats:
-    """Scale each row to unit norm in float64 and return float32; a row of zeros stays zero. (..., D) -> (..., D)"""
+    """Return each row scaled to unit norm in float64, as float32. A row of zeros stays zero. (..., D) -> (..., D)"""
     exact = rows.astype(np.float64)
     norms = np.linalg.norm(exact, axis=-1, keepdims=True)
     return (exact / np.where(norms > 0, norms, 1.0)).astype(np.float32)
 
 
 class WordIndex:
-    """A search index of (K, D) uint8 words, none zero."""
+    """A search index of (K, D) uint8 words, none of them zero."""
 
     def __init__(self, words: Bytes) -> None:
         import torch
@@ -49,11 +49,11 @@ class WordIndex:
         Parameters
         ----------
         queries : (N, D) uint8 or float32, of any norm
-        progress : called with the number of queries just done
+        progress : called with the number of queries of each finished batch
 
         Returns
         -------
-        (N,) int64. Cosines are compared as dot² / |word|² in float64; uint8 rows have exact dot products in it.
+        (N,) int64. Cosines are compared as dot² / |word|² in float64, in which dot products of uint8 rows are exact.
         """
         import torch
 
@@ -69,7 +69,7 @@ class WordIndex:
         return found
 
     def _find_candidates(self, queries: Tensor, errors: Tensor) -> tuple[np.ndarray, np.ndarray]:
-        """Find the pairs of a query and a word that may be its nearest. (n, D), (n,) rounding errors -> (P,), (P,)"""
+        """Return the pairs of a query and a word that may be its nearest. (n, D), (n,) rounding errors -> (P,), (P,)"""
         import torch
 
         blocks = self._coarse.split(BLOCK)
@@ -86,10 +86,10 @@ class WordIndex:
         return torch.cat(rows).cpu().numpy(), torch.cat(words).cpu().numpy()
 
     def _decide(self, queries: Bytes | Floats, rows: np.ndarray, words: np.ndarray) -> np.ndarray:
-        """Select among the candidates of each query the word of greatest cosine. (n, D), (P,), (P,) -> (n,)"""
+        """Return the candidate of greatest cosine of each query. (n, D), (P,), (P,) -> (n,)"""
         exact = self._words[words].astype(np.float64)  # (P, D)
         dots = np.einsum("pd,pd->p", queries[rows].astype(np.float64), exact)
-        # Words of one direction must compare equal: the squares of integers divide to one and the same double.
+        # Words of one direction must compare equal: quotients of squares of integers give the same double.
         scores = dots * np.abs(dots) / np.einsum("pd,pd->p", exact, exact)
         order = np.lexsort((words, -scores, rows))
         first = np.unique(rows[order], return_index=True)[1]
@@ -97,15 +97,16 @@ class WordIndex:
 
 
 def rounding(exact: Tensor, coarse: Tensor) -> Tensor:
-    """Rounding error of each row. (n, D), (n, D) -> (n,) on the device of the second"""
+    """Return the rounding error of each row. (n, D), (n, D) -> (n,) on the device of the second"""
     return (coarse.float() - exact.to(coarse.device)).norm(dim=1)
 
 
 def margin(best: Tensor, errors: Tensor, dtype: torch.dtype) -> Tensor:
-    """Greatest deficit of the nearest word's approximate cosine below the greatest one. (n,), (n,) -> (n,)
+    """Return the largest difference between the greatest approximate cosine and that of the nearest word. (n,), (n,) -> (n,)
 
-    By Cauchy-Schwarz a cosine is off by at most the sum of the distances that its unit rows were moved, and then by half a unit
-    in the last place as it is rounded itself: a quarter of the type's `eps` below one, half of it above. Two are compared.
+    By Cauchy-Schwarz, rounding the two unit rows changes their cosine by at most the sum of the rows' rounding errors. Rounding
+    the cosine adds half a unit in the last place: a quarter of the type's `eps` below one, half of it above. The result counts
+    both errors twice, since two cosines are compared.
     """
     import torch
 
@@ -114,5 +115,5 @@ def margin(best: Tensor, errors: Tensor, dtype: torch.dtype) -> Tensor:
 
 
 def block_maxima(queries: Tensor, block: Tensor) -> Tensor:
-    """Greatest approximate cosine of each query in one block of words. (n, D), (b, D) -> (n,)"""
+    """Return the greatest approximate cosine of each query in one block of words. (n, D), (b, D) -> (n,)"""
     return (queries @ block.T).amax(dim=1)

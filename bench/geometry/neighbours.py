@@ -1,7 +1,7 @@
-"""Neighbours of words in the same dictionary: the nearest ones, and the number of words at each level of similarity.
+"""Neighbours of words in the same dictionary: the nearest words, and the number of words at each level of similarity.
 
-Words are 8-bit, so their dot products are integers below 2^24 and exact in float32 in any order of summation. Results depend on
-two words alone: not on the other words of a query, the number of threads or the machine.
+Words are 8-bit, so their dot products are integers below 2^24, which are exact in float32 in any order of summation. The result
+for two words depends on these two alone. It does not depend on the other words of a query, the number of threads or the machine.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ Doubles = NDArray[np.float64]
 
 BLOCK = 2048  # words in a block
 BATCH = 512  # words per query batch
-CACHE_LIMIT = 2**26  # greatest size of a table of levels that is kept
+CACHE_LIMIT = 2**26  # greatest size of a cached table of levels
 
 
 class Neighbours:
-    """A comparison index of (K, D) uint8 words, none zero."""
+    """An index for comparisons among (K, D) uint8 words, none of them zero."""
 
     def __init__(self, words: Bytes) -> None:
         import torch
@@ -34,7 +34,7 @@ class Neighbours:
         self._words = exact.to(pick_device())  # (K, D)
         self._lengths = exact.double().square().sum(dim=1).sqrt().to(pick_device())  # (K,)
         self._nearest: dict[int, Indices] = {}  # count -> (K, count), -1 where not computed yet
-        self._levels: dict[bytes, NDArray[np.int32]] = {}  # borders -> (K, blocks, L + 1), likewise
+        self._levels: dict[bytes, NDArray[np.int32]] = {}  # borders -> (K, blocks, L + 1), -1 where not computed yet
 
     def find_nearest(self, words: Indices, count: int) -> Indices:
         """Return each word and its count − 1 nearest by cosine, ties to the lowest index. (n,) -> (n, count), ascending
@@ -85,7 +85,7 @@ class Neighbours:
         return range(0, len(self._words), BLOCK)
 
     def count_levels(self, words: Indices, borders: Doubles) -> Indices:
-        """Count the words at each level, the number of borders that their cosine reaches. Small tables are cached.
+        """Return the number of words at each level: the number of borders that their cosine reaches. Small tables are cached.
 
         Parameters
         ----------
@@ -115,7 +115,7 @@ class Neighbours:
         return found
 
     def select_words(self, words: Indices, borders: Doubles, counts: Indices, levels: Indices, ranks: Indices) -> Indices:
-        """Return for each word the one at a given rank, by index, among the words of a level.
+        """Return for each word the word at a given rank among the words of a level, which are ordered by index.
 
         Parameters
         ----------

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 
 def select_independent_rows(matrices: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Select k rows of each (D, k) matrix, each the one farthest from the span of those before it. (N, D, k) -> (N, k)"""
+    """Return k rows of each (D, k) matrix, each the row farthest from the span of the previous ones. (N, D, k) -> (N, k)"""
     count, _, k = matrices.shape
     rest = matrices.copy()
     selection = np.empty((count, k), dtype=np.int64)

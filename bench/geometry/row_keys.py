@@ -1,4 +1,4 @@
-"""Hash keys of rows, to find equal rows."""
+"""Hash keys of rows, for the search of equal rows."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from bench.types import Bytes, Floats
 
 
 def hash_rows(rows: Bytes | Floats) -> NDArray[np.uint64]:
-    """Return a 64-bit key of each row. Among 10 million different rows two keys agree with chance 3e-6. (..., D) -> (...,)
+    """Return a 64-bit key of each row. Among 10 million different rows, two have one key with chance 3e-6. (..., D) -> (...,)
 
-    Rows are compared bit by bit; they have a multiple of 8 bytes.
+    Keys depend on the bits of the rows, whose size must be a multiple of 8 bytes.
     """
     lanes = np.ascontiguousarray(rows).view(np.uint64)  # (..., D itemsize / 8)
     factors = 2 * np.random.default_rng(0).integers(2**63, size=lanes.shape[-1:], dtype=np.uint64) + 1  # odd

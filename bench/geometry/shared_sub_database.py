@@ -1,7 +1,7 @@
-"""Finds releases that share a release's sub-database, and the intersections of its subspaces with theirs.
+"""Search for releases with the same sub-database as a given release, and for intersections of their subspaces with its own.
 
-The adversarial words of a photograph come from one of n sub-databases, so one release in n shares it. Two that share it intersect
-about N N' a² / S times, for N and N' subspaces through a words each, of S words. A sample of each release decides.
+The adversarial words of a photograph come from one of n sub-databases, so one release in n uses the same one. Two such releases
+of N and N' subspaces, with a words each from S words, have about N N' a² / S intersections. A sample of each release decides.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from bench.geometry.intersections import (
 from bench.types import Points, Release, Subspaces
 
 BATCH = 16  # releases per batch
-SAMPLE_INTERSECTIONS = 8.0  # expected number with the sample of a sharing release: one in 3,000 has none
+SAMPLE_INTERSECTIONS = 8.0  # expected number for a sample of a release with the same sub-database: 1 sample in 3,000 has none
 PAIRS = 1024  # intersections measured at a time
-EQUAL_TOLERANCE = 1e-5  # points whose images on a line are nearer count as one
+EQUAL_TOLERANCE = 1e-5  # points with nearer images on a line count as one
 
 
 @dataclass(frozen=True, eq=False)
 class SharedSubDatabase:
-    """The subspaces that share a target's sub-database, and their intersections with the target's subspaces."""
+    """Subspaces from the same sub-database as a target's, and their intersections with the target's subspaces."""
 
     subspaces: Subspaces  # of the target, then of the sharing releases
     intersections: SubspaceIntersections  # of the target's subspaces (`first`) with any of these (`second`); its own pairs twice
@@ -43,12 +43,12 @@ class SharedSubDatabase:
 
 
 def find_shared_sub_database(target: Subspaces, others: Iterator[Release], words: int, enough: float) -> SharedSubDatabase:
-    """Search other releases until the intersections cover a fraction `enough` of the words in the target's subspaces.
+    """Search other releases, until the intersections cover a fraction `enough` of the words in the target's subspaces.
 
     Parameters
     ----------
     others : releases of the same defense
-    words : per subspace
+    words : number of words per subspace
     enough : from 0 to 1
 
     Raises
@@ -81,7 +81,7 @@ def _require_subspaces(release: Release) -> Subspaces:
 
 
 def stack_subspaces(releases: Sequence[Subspaces]) -> Subspaces:
-    """Concatenate the subspaces of one or more releases."""
+    """Return the subspaces of one or more releases as one release."""
     return replace(
         releases[0],
         positions=Points(keypoints=np.concatenate([release.keypoints for release in releases])),
@@ -91,8 +91,8 @@ def stack_subspaces(releases: Sequence[Subspaces]) -> Subspaces:
 
 
 def _select_sharing(target: Subspaces, releases: Sequence[Subspaces], chance: float) -> list[Subspaces]:
-    """Select the releases with a sample that intersects the target; `chance` is that of two subspaces of a shared one."""
-    # Any rows will do: words are drawn independently for each keypoint.
+    """Return the releases with a sample that intersects the target; `chance` is that of two subspaces to intersect."""
+    # The choice of rows does not matter: words are drawn independently for each keypoint.
     size = math.ceil(SAMPLE_INTERSECTIONS / (chance * len(target))) if chance else max(map(len, releases))
     samples = [release.take(np.arange(min(size, len(release)))) for release in releases]
     owners = np.repeat(np.arange(len(releases)), [len(sample) for sample in samples])
@@ -101,7 +101,7 @@ def _select_sharing(target: Subspaces, releases: Sequence[Subspaces], chance: fl
 
 
 def _compute_coverage(intersections: SubspaceIntersections, words: int) -> float:
-    """Fraction of the `words` words of the `first` subspaces with an intersection; several at one word count once."""
+    """Return the fraction of words in the `first` subspaces that lie in an intersection. `words` is their number."""
     points = intersections.take(intersections.single)
     line = np.random.default_rng(0).normal(size=points.points.shape[1])
     images = points.points @ line
@@ -111,7 +111,7 @@ def _compute_coverage(intersections: SubspaceIntersections, words: int) -> float
 
 
 def compute_intersection_distances(points: Doubles, shared: SharedSubDatabase) -> Doubles:
-    """Distance from points of each target subspace to the nearest subspace that intersects it; infinite without one.
+    """Return the distance from points of each target subspace to the nearest subspace that intersects it; infinite without one.
 
     min_j dist(x_i, Q'_j) in the paper's terms. (N, p, D) -> (N, p)
     """

@@ -1,11 +1,11 @@
 """Search for the words nearest to affine subspaces: a fast pass finds the candidates, float64 decides among them.
 
-With p the point of D nearest to zero and B its orthonormal basis, a unit word u has dist(D, u)² = 1 + |p|² − s, where its score
-s = 2 p·u + |B u|². So nearly all of the work is one matrix product, 2·N·(dim + 1)·K·D operations: the floor.
+Let p be the point of D nearest to zero and B its orthonormal basis. A unit word u has dist(D, u)² = 1 + |p|² − s with the score
+s = 2 p·u + |B u|². So nearly all of the work is one matrix product of 2·N·(dim + 1)·K·D operations, which is the floor.
 
-No near word is lost. The fast pass rounds p, B and each product, so its score is off by at most E (`_bound_error`). Let s' be
-the lowest of its `count` highest scores: the true score of that word is at least s' − E. A word scored below s' − 2 E has a lower
-true score. Every other word is a candidate. Zero is no special case; float64 separates it from small distances.
+No near word is lost. The fast pass rounds p, B and each product, so its scores err by at most E (`_bound_error`). Let s' be the
+lowest of its `count` highest scores. The true score of that word is at least s' − E. A word with a score below s' − 2 E has a
+lower true score. Every other word is a candidate. Zero is no special case; float64 separates it from small distances.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ if TYPE_CHECKING:
 Doubles = NDArray[np.float64]
 
 BLOCK = 2048  # words in a block
-ROWS = 1024  # rows of B and p per pass over the words: a block of products stays in the cache
-GROUP = 32  # greatest number of words tested one by one only if the best of them may be near
+ROWS = 1024  # rows of B and p per pass over the words: a block of products then fits into the cache
+GROUP = 32  # greatest size of a group of words; its words are tested individually only if the best of them may be near
 GROUPS = 32  # least number of groups per requested word, if there are enough words
-NEAR = 1024  # requested words, over several subspaces, that float64 decides together
+NEAR = 1024  # requested words, of several subspaces, per batch in float64
 FAR = 1e9  # placeholder distance of a missing word
-TIE_TOLERANCE = 1e-12  # distances that differ by less count as equal; float64 errs by about 1e-16
+TIE_TOLERANCE = 1e-12  # distances with a smaller difference count as equal; float64 errs by about 1e-16
 
 
 def find_nearest_to_subspaces(release: Subspaces, words: Bytes | Floats, count: int = 1) -> tuple[Indices, Doubles]:
@@ -39,12 +39,12 @@ def find_nearest_to_subspaces(release: Subspaces, words: Bytes | Floats, count: 
 
     Parameters
     ----------
-    words : (K, D) uint8 or float32, none zero; their directions count, as `unit_rows` gives them
-    count : number of words; all if there are fewer
+    words : (K, D) uint8 or float32, none zero; only their directions count, as `unit_rows` returns them
+    count : number of words per subspace; all if there are fewer
 
     Returns
     -------
-    (N, min(count, K)) int64 and float64. Distances are to the released float32 subspace: adversarial words lie about 1e-7 off.
+    (N, min(count, K)) int64 and float64. Distances are to the released float32 subspace: about 1e-7 for adversarial words.
     """
     count = min(count, len(words))
     feet, frames = feet_and_frames(release)
@@ -82,7 +82,7 @@ def project(release: Subspaces, points: Doubles) -> Doubles:
 
 
 def _find_candidates(feet: Doubles, frames: Doubles, words: Bytes | Floats, count: int) -> tuple[Indices, Indices]:
-    """Find pairs of a subspace and a word that may be near it, by subspace. (n, D), (n, dim, D), (K, D) -> (P,) twice"""
+    """Return pairs of a subspace and a word that may be near it, by subspace. (n, D), (n, dim, D), (K, D) -> (P,) twice"""
     import torch
 
     device = pick_device()
@@ -92,7 +92,7 @@ def _find_candidates(feet: Doubles, frames: Doubles, words: Bytes | Floats, coun
     error = _bound_error(exact, coarse.double().numpy(), dtype, words.dtype)  # (n,)
     planes, allowed = coarse.to(device), torch.from_numpy(2 * error).float().to(device)[:, None]
     size = max(1, min(GROUP, len(words) // (GROUPS * count)))
-    # The highest scores so far, one per group: the lowest of them is a lower bound of the count-th highest.
+    # The highest scores so far, one per group. The lowest of them is a lower bound of the count-th highest score.
     best = torch.full((len(feet), count), torch.finfo(torch.float32).min, device=device)
     waiting, pairs = [], []
     for start in range(0, len(words), BLOCK):
@@ -115,7 +115,7 @@ def _find_candidates(feet: Doubles, frames: Doubles, words: Bytes | Floats, coun
 
 
 def _select_at_least(least: Tensor, start: int, groups: Tensor, maxima: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Select the words of a block by score: subspace, word, score. (n, 1), start, (n, size, G), (n, G) -> three of (P,)"""
+    """Return subspace, word and score of a block's high scores. (n, 1), start, (n, size, G), (n, G) -> three of (P,)"""
     row, group = (maxima >= least).nonzero(as_tuple=True)
     members = groups[row, :, group]  # (S, size)
     hit, member = (members >= least[row]).nonzero(as_tuple=True)
@@ -123,7 +123,7 @@ def _select_at_least(least: Tensor, start: int, groups: Tensor, maxima: Tensor) 
 
 
 def _compute_scores(planes: Tensor, block: Tensor) -> Tensor:
-    """Approximate 2 p·u + |B u|². (1 + dim, n, D), (K', D) -> (n, K') float32"""
+    """Return approximate scores 2 p·u + |B u|². (1 + dim, n, D), (K', D) -> (n, K') float32"""
     import torch
 
     scale = block.float().square().sum(dim=1).rsqrt()  # (K',) words are multiplied unscaled: bytes are exact in bf16
@@ -136,11 +136,11 @@ def _compute_scores(planes: Tensor, block: Tensor) -> Tensor:
 
 
 def _bound_error(exact: Doubles, rounded: Doubles, dtype: torch.dtype, words: np.dtype) -> Doubles:
-    """Bound the error of a score of the fast pass. (1 + dim, n, D) twice -> (n,)
+    """Return a bound of the error of a score of the fast pass. (1 + dim, n, D) twice -> (n,)
 
-    Let r bound the relative error of one rounding (2^-8 for bf16), and let p', B', u' be the rounded p, B, u.
-    s = D 2^-23 is twice what a sum of D products in float32 can err by, relative to the norms, which covers the few float32
-    operations that follow as well. Then p·u errs by at most
+    Let r bound the relative error of one rounding (2^-8 for bf16), and let p', B', u' be the rounded p, B, u. Let s = D 2^-23,
+    which is twice the greatest error, relative to the norms, of a sum of D products in float32. The factor of two covers the few
+    float32 operations that follow. Then p·u errs by at most
 
         t = |p' − p| + |p| (|u' − u| + s)          and then by r |p·u| as it is rounded,
 
@@ -167,7 +167,7 @@ def _bound_error(exact: Doubles, rounded: Doubles, dtype: torch.dtype, words: np
 def _decide(
     feet: Doubles, frames: Doubles, words: Bytes | Floats, rows: Indices, near: Indices, count: int
 ) -> tuple[Indices, Doubles]:
-    """Select the nearest among the candidates of each subspace. (n, D), (n, dim, D), (K, D), (P,) twice -> (n, count) twice"""
+    """Return the nearest candidates of each subspace. (n, D), (n, dim, D), (K, D), (P,) twice -> (n, count) twice"""
     nearest, distances = np.empty((len(feet), count), dtype=np.int64), np.empty((len(feet), count))
     few = max(1, NEAR // count)
     for start in range(0, len(feet), few):

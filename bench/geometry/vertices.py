@@ -1,13 +1,12 @@
 """Degenerate vertices of a batch of polytopes {x = o + Bᵀ c : x >= 0}, by the simplex method in coordinates of the subspace.
 
-A vertex is where `dim` components vanish, its *frame*; it is degenerate where more do. With s the components of the frame, x
-= T [1, s] for a tableau T (D, 1 + dim), whose first column is the vertex. A pivot removes one component from the frame,
-follows that edge to the least objective, and adds the component that vanishes there to the frame: an update of
-rank one.
+At a vertex, `dim` components vanish: its *frame*. The vertex is degenerate if more components vanish. With s the components of
+the frame, x = T [1, s] for a tableau T (D, 1 + dim), whose first column is the vertex. A pivot removes one component from the
+frame and follows that edge to the least objective. The component that vanishes there joins the frame, an update of rank one.
 
-The objective is Σ_j w_j x_j, a negative x_j counting PENALTY w_j |x_j|, so that no feasible initial vertex is needed.
-Along an edge it is convex and piecewise linear. At an optimum the weights become 1 / (x + SOFT) (reweighted L1; Candès,
-Wakin, Boyd 2008), and after ROUNDS of those they are drawn again.
+The objective is Σ_j w_j x_j. A negative x_j counts PENALTY w_j |x_j|, so no feasible initial vertex is needed. Along an edge the
+objective is convex and piecewise linear. At an optimum the weights become 1 / (x + SOFT) (reweighted L1; Candès, Wakin, Boyd
+2008). After ROUNDS of these updates the weights are drawn again.
 """
 
 from __future__ import annotations
@@ -29,12 +28,12 @@ Doubles = NDArray[np.float64]
 PENALTY = 20.0
 SOFT = 0.02
 ROUNDS = 4
-ZERO = 1e-6  # a component no larger counts as zero: float32 leaves errors of about 1e-8, which a frame amplifies
+ZERO = 1e-6  # components up to this count as zero: float32 has errors of about 1e-8, which a frame amplifies
 UNIT = 1e-5  # a norm this near to 1 counts as 1
 FLAT = 1e-6  # a component that changes by less along an edge is constant on it
-SLOPE = 1e-9  # an edge along which the objective falls by less does not lead down
-EQUAL_TOLERANCE = 1e-4  # vertices that agree when rounded to this are one
-BATCH = 256  # polytopes per batch, so that their tableaus stay in the cache
+SLOPE = 1e-9  # an edge with a smaller descent of the objective does not lead down
+EQUAL_TOLERANCE = 1e-4  # vertices that are equal after rounding to this count as one
+BATCH = 256  # polytopes per batch, whose tableaus fit into the cache
 REFRESH = 32  # pivots after which tableaus are recomputed and finished walks are dropped
 
 
@@ -65,7 +64,7 @@ def find_unit_vertices(
 def _walk(
     origins: Doubles, bases: Doubles, pivots: int, enough: Callable[[Tensor], Tensor], rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], Doubles]:
-    """`unit_vertices` of one block."""
+    """Compute `find_unit_vertices` for one batch, without polishing."""
     import torch
 
     count, dim, length = bases.shape
@@ -104,13 +103,13 @@ def _walk(
 
 
 def _certify(x: Tensor, varying: Tensor, dim: int) -> Tensor:
-    """Whether the vertex is degenerate, non-negative and of norm 1. (n, D), (n, D) -> (n,)"""
+    """Return whether each vertex is degenerate, non-negative and of norm 1. (n, D), (n, D) -> (n,)"""
     vanishing = ((x.abs() <= ZERO) & varying).sum(dim=1)
     return (vanishing > dim) & (x.amin(dim=1) >= -ZERO) & ((x.norm(dim=1) - 1).abs() <= UNIT)
 
 
 def _build_tableau(o: Tensor, b: Tensor, frame: Tensor) -> Tensor:
-    """Build the tableau of each frame. (n, D), (n, dim, D), (n, dim) -> (n, D, 1 + dim)"""
+    """Return the tableau of each frame. (n, D), (n, dim, D), (n, dim) -> (n, D, 1 + dim)"""
     import torch
 
     at_frame = b.gather(2, frame[:, None].expand(-1, b.shape[1], -1))  # (n, dim, dim)
@@ -120,7 +119,7 @@ def _build_tableau(o: Tensor, b: Tensor, frame: Tensor) -> Tensor:
 
 
 def _select_edge(tableau: Tensor, frame: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Select the edge of steepest descent: its index, direction and slope. -> (n,) index, (n,) ±1, (n,)"""
+    """Return the edge of steepest descent. -> (n,) index, (n,) direction ±1, (n,) slope"""
     import torch
 
     x = tableau[:, :, 0]
@@ -134,7 +133,7 @@ def _select_edge(tableau: Tensor, frame: Tensor, weights: Tensor) -> tuple[Tenso
 
 
 def _select_component(tableau: Tensor, frame: Tensor, weights: Tensor, edge: Tensor, sign: Tensor, slope: Tensor) -> Tensor:
-    """Select the component that vanishes at the least objective along an edge. -> (n,)"""
+    """Return the component that vanishes at the least objective along an edge. -> (n,)"""
     import torch
 
     x = tableau[:, :, 0]

@@ -1,7 +1,7 @@
-"""Reads photographs as 256 x 256 RGB, by one rule.
+"""Photographs as 256 x 256 RGB images, all converted by one rule.
 
-The rule: EXIF rotation is applied. Transparency is composited over white. One channel is repeated three times. 16 bits are
-scaled to 8. The largest centred square is cropped and resized with Pillow's bicubic filter, which averages when it shrinks.
+The rule: EXIF rotation is applied. Transparency is composited over white. A single channel is repeated three times. 16 bits are
+scaled to 8. The largest centred square is cropped and resized with Pillow's bicubic filter, which averages if it shrinks.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ SUFFIXES = {".jpg", ".jpeg", ".png", ".ppm", ".webp"}
 
 @dataclass(frozen=True)
 class Source:
-    """A photograph on disk, not read yet."""
+    """A photograph on disk, not yet read."""
 
     name: str
     path: Path
@@ -37,7 +37,7 @@ class Source:
 
 @dataclass(frozen=True, eq=False)
 class Photograph:
-    """(256, 256, 3) uint8 RGB, and notes on its conversion."""
+    """A photograph as (256, 256, 3) uint8 RGB, with notes on its conversion."""
 
     pixels: Bytes
     notes: tuple[str, ...] = ()
@@ -46,8 +46,8 @@ class Photograph:
 def list_photographs(directory: Path) -> list[Source]:
     """Return the JPEG, PNG, PPM and WebP files of a folder and its subfolders, sorted by path.
 
-    Of MegaDepth (Li and Snavely, CVPR 2018), only those in `dense*/imgs` are photographs. Of HPatches (Balntas et al.,
-    CVPR 2017), all six of each sequence.
+    In MegaDepth (Li and Snavely, CVPR 2018), only files in `dense*/imgs` are photographs. In HPatches (Balntas et al., CVPR
+    2017), all six files of each sequence are.
 
     Raises
     ------
@@ -64,15 +64,15 @@ def list_photographs(directory: Path) -> list[Source]:
 
 
 def split_validation(sources: list[Source], selection: Path | None) -> tuple[list[Source], list[Source]]:
-    """Split photographs into a training set and a validation set.
+    """Return photographs split into a training set and a validation set.
 
-    `selection` is a folder of other photographs, or a text file with the names of those to hold out, one a line. None holds
-    out every twentieth.
+    `selection` is a folder of other photographs for validation, or a text file with the names of the validation photographs, one
+    per line. For None, every twentieth photograph is for validation.
 
     Raises
     ------
     UserError
-        if `selection` does not exist, or names none of the photographs.
+        if `selection` does not exist, or contains the name of no photograph.
     """
     if selection is not None and selection.is_dir():
         return sources, list_photographs(selection)
@@ -84,12 +84,12 @@ def split_validation(sources: list[Source], selection: Path | None) -> tuple[lis
         raise UserError(f"{selection}: no such folder or file")
     validation = [source for source in sources if source.name in names]
     if not validation:
-        raise UserError(f"{selection}: names none of the photographs")
+        raise UserError(f"{selection}: names none of the photographs; write one name per line, relative to --images")
     return [source for source in sources if source.name not in names], validation
 
 
 def list_builtin() -> list[Source]:
-    """Return the seven colour photographs in the wheels of scikit-image and scikit-learn."""
+    """Return seven colour photographs from the wheels of scikit-image and scikit-learn."""
     names = ("astronaut.png", "chelsea.png", "coffee.png", "rocket.jpg", "motorcycle_left.png")
     return [*_find_in_scikit_image(*names), *_find_in_scikit_learn("china.jpg", "flower.jpg")]
 
@@ -121,7 +121,7 @@ def _find_in_scikit_learn(*names: str) -> list[Source]:
 
 
 def _find_in_package(package: str, directory: str, *names: str) -> list[Source]:
-    """Return data files of a package without importing it: the import would take seconds."""
+    """Return data files of a package without importing it, which would take seconds."""
     spec = importlib.util.find_spec(package)
     assert spec is not None
     assert spec.origin is not None
@@ -149,7 +149,7 @@ def decode(path: Path, upright: bool = True) -> tuple[Image.Image, tuple[str, ..
     except Image.DecompressionBombError as error:
         raise SampleError(f"{path.name}: too many pixels to read safely ({error})") from error
     except (OSError, SyntaxError, ValueError) as error:
-        # Pillow says "image file is truncated", "cannot identify image file", ...
+        # Messages of Pillow: "image file is truncated", "cannot identify image file", ...
         raise SampleError(f"{path.name}: cannot be read as an image: {error}") from error
     if min(image.size) < MIN_SIDE:
         raise SampleError(f"{path.name}: {image.width} x {image.height} pixels; at least {MIN_SIDE} x {MIN_SIDE} are needed")

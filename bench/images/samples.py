@@ -1,4 +1,4 @@
-"""Samples: each record is about one photograph, pair of images, query of a scene, or whole scene."""
+"""Samples: a photograph, a pair of images, a query of a scene, or a whole scene. Each record is about one sample."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ Images = Path | str | Sequence[Path | str | Source] | None
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Sample:
-    """One sample of an experiment. The runner extracts and protects each of its images."""
+    """One sample of an experiment. The runner extracts and protects all of its images."""
 
     name: str
     images: tuple[ImageSource, ...]
-    condition: str | None = None  # such as "night"; results are grouped by it
+    condition: str | None = None  # such as "night"; tables group results by it
     subject: Any = None  # task-specific data
 
     def content_hash(self) -> str:
-        """Hash all images. An unreadable image contributes its error."""
+        """Return the hash of all images. An unreadable image contributes its error."""
         hashes = [_content_hash(image) for image in self.images]
         return hashes[0] if len(hashes) == 1 else digest(hashes)
 
@@ -43,7 +43,7 @@ class Collection:
 
     name: str
     samples: tuple[Sample, ...]
-    scene: Scene | None = None  # of all samples, if they have one in common
+    scene: Scene | None = None  # the scene of all samples; None if they have no common scene
     extra_inputs: Mapping[str, str] = field(default_factory=dict)  # digests of inputs other than the samples' images
 
 
@@ -142,7 +142,7 @@ def _list_sources(images: Images) -> tuple[str, list[Source]]:
         return Path(images).resolve().name, photographs.list_photographs(Path(images))
     sources = [image if isinstance(image, Source) else Source(Path(image).name, Path(image)) for image in images]
     if len({source.name for source in sources}) < len(sources):
-        raise UserError("two of the photographs have the same file name")
+        raise UserError("two of the photographs have the same file name; rename one of them")
     if not sources:
-        raise UserError("no photograph was given")
+        raise UserError("no photograph was given; give at least one, or None for the built-in ones")
     return "files", sources

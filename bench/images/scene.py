@@ -1,8 +1,8 @@
 """Scenes: reference images with known poses, and queries to localize or reconstruct.
 
-One convention everywhere, COLMAP's. A pose is `cam_from_world`: x_camera = R x_world + t; the camera's x goes right, its y down,
-its z forward, and its centre is -Rᵀt. In an image the centre of the top-left pixel is (0.5, 0.5). Quaternions in files are
-written w x y z (pycolmap's own arrays are x y z w).
+All conventions are COLMAP's. A pose is `cam_from_world`: x_camera = R x_world + t. The camera's x axis points right, its y axis
+down, its z axis forward, and its centre is -Rᵀt. The centre of the top-left pixel is (0.5, 0.5). Quaternions in files are written
+w x y z; the arrays of pycolmap are x y z w.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Mask = NDArray[np.bool_]
 
 
 class Pixels(ABC):
-    """The pixels of an image, read on demand. Can be pickled, for other processes."""
+    """Pixels of an image, read on demand. Objects can be pickled for other processes."""
 
     @abstractmethod
     def content_hash(self) -> str:
@@ -36,7 +36,7 @@ class Pixels(ABC):
 
     @abstractmethod
     def read(self) -> Bytes:
-        """Return (H, W, 3) uint8 RGB in the size of the image's camera."""
+        """Return (H, W, 3) uint8 RGB, in the size of the image's camera."""
 
     def foreground(self) -> Mask | None:
         """Return the mask of moving objects in front of the scene, (H, W); None if it is not known."""
@@ -45,17 +45,17 @@ class Pixels(ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class File(Pixels):
-    """A photograph on disk, read without EXIF rotation: intrinsics are of the stored image."""
+    """A photograph on disk, read without EXIF rotation, since intrinsics are those of the stored image."""
 
     path: Path
     size: tuple[int, int]  # width, height of the camera
-    mask: Path | None = None  # an image, white on the foreground
+    mask: Path | None = None  # an image that is white on the foreground
 
     def content_hash(self) -> str:
         return Source(self.path.name, self.path).content_hash()
 
     def read(self) -> Bytes:
-        """Raise SampleError if the file cannot be decoded or has another size."""
+        """Return the pixels; raise SampleError if the file cannot be decoded or has another size."""
         return np.array(self._decode(self.path))
 
     def foreground(self) -> Mask | None:
@@ -72,9 +72,9 @@ class File(Pixels):
 class SceneImage:
     """One image of a scene."""
 
-    name: str  # as in lists and models, with / between folders
-    camera: pycolmap.Camera  # intrinsics; its id means nothing
-    cam_from_world: pycolmap.Rigid3d | None  # in the scene's unit of length; None if it is withheld
+    name: str  # as in lists and models, with / as the separator of folders
+    camera: pycolmap.Camera  # intrinsics; its id is not used
+    cam_from_world: pycolmap.Rigid3d | None  # in the scene's unit of length; None if withheld
     condition: Condition
     pixels: Pixels
 

@@ -1,4 +1,4 @@
-"""Views of a photograph, to build dictionaries from and to train networks on."""
+"""Views of photographs, for the construction of dictionaries and the training of networks."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def _extract_view(pixels: Bytes, mirrored: bool, photograph: str, source: Source
 
 
 class LazyViews(Sequence[PhotographView]):
-    """The views of `extract_views` for any number of photographs, in the same order, extracted at each access.
+    """Sequence of the views of `extract_views` for any number of photographs, extracted at each access.
 
     Iteration skips views that cannot be extracted.
     """
@@ -118,5 +118,5 @@ def collect_views(sources: list[Source], extractor: Extractor) -> list[Photograp
                 progress.log(f"skipped: {error}")
             progress.advance()
     if not views:
-        raise UserError("none of the photographs could be used")
+        raise UserError("none of the photographs could be used; see the messages above")
     return views

@@ -1,8 +1,8 @@
-"""Training data: random crops of 256 x 256 pixels and a new release of each.
+"""Training data: random crops of 256 x 256 pixels, and a new release of each.
 
-A photograph is never quantised by a dictionary built from it. It would quantise to nearly itself, so the network would trust its
-input too much and the defense would look safer than it is. Each photograph uses the defense's own dictionary if it is not part
-of it, else the first cross-fit dictionary that does not contain it.
+A photograph is never quantised by a dictionary built from it. Its descriptors would be quantised to nearly themselves. The
+network would then trust its input too much, and the defense would look safer than it is. So each photograph uses the first
+dictionary that was not built from it: the defense's own, or else a cross-fit dictionary.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ SupportedSettings = Mapping[str, Between | OneOf]
 
 @dataclass(frozen=True, eq=False)
 class Example:
-    """A crop, its release, and the settings that the attacker knows."""
+    """A crop, its release, and the public settings of the defense."""
 
     pixels: Bytes  # (256, 256, 3)
     release: Release
@@ -42,7 +42,7 @@ class Example:
 
 @dataclass(frozen=True, eq=False)
 class Examples:
-    """Draws examples of one defense from a set of views."""
+    """A generator of training examples of one defense from a set of views."""
 
     views: Sequence[PhotographView]
     defense: Defense
@@ -52,7 +52,7 @@ class Examples:
     symmetries: Sequence[Symmetry] = (IDENTITY,)  # drawn uniformly
 
     def draw(self, rng: np.random.Generator) -> Example:
-        """Draw a random crop of a random view under random supported settings and a random symmetry.
+        """Return a random crop of a random view, with random supported settings and a random symmetry.
 
         Raises
         ------
@@ -60,18 +60,18 @@ class Examples:
             if no view out of 100 can be used.
         """
         for _ in range(100):
-            with suppress(SampleError):  # views on demand may be unreadable
+            with suppress(SampleError):  # a view that is read on demand may be unreadable
                 view = self.views[int(rng.integers(len(self.views)))]
                 break
         else:
-            raise UserError("none of 100 photographs could be used")
+            raise UserError("none of 100 randomly drawn photographs could be read; check --images")
         example = self._release(view.photograph, *draw_crop(view, rng), rng)
         symmetry = self.symmetries[int(rng.integers(len(self.symmetries)))]
         pixels, release = symmetry.transform_image(example.pixels), symmetry.transform_release(example.release)
         return dataclasses.replace(example, pixels=pixels, release=release)
 
     def release_view(self, view: PhotographView, rng: np.random.Generator) -> Example:
-        """Release a whole view of 256 x 256 pixels under random supported settings."""
+        """Return a whole view of 256 x 256 pixels and its release, with random supported settings."""
         return self._release(view.photograph, view.pixels, view.features, rng)
 
     def _release(self, photograph: str, pixels: Bytes, secret: Features, rng: np.random.Generator) -> Example:
@@ -83,7 +83,7 @@ class Examples:
 
 
 def draw_crop(view: PhotographView, rng: np.random.Generator) -> tuple[Bytes, Features]:
-    """Draw a 256 x 256 window with at least one keypoint."""
+    """Return a random window of 256 x 256 pixels with at least one keypoint, and its features."""
     room = len(view.pixels) - SIDE
     while True:
         left, top = rng.integers(room + 1, size=2)
@@ -98,7 +98,7 @@ def draw_crop(view: PhotographView, rng: np.random.Generator) -> tuple[Bytes, Fe
 
 
 def assign_dictionaries(photographs: set[str], candidates: Sequence[Asset], public: Public) -> dict[str, Asset]:
-    """Assign to each photograph the first dictionary that was not built from it.
+    """Return for each photograph the first dictionary that was not built from it.
 
     Raises
     ------
@@ -110,7 +110,7 @@ def assign_dictionaries(photographs: set[str], candidates: Sequence[Asset], publ
         unrelated = [asset for asset in candidates if photograph not in public.dictionary(asset).photographs]
         if not unrelated:
             raise UserError(
-                "a training photograph is part of the dictionary and would quantise to nearly itself; "
+                "the dictionary was built from a training photograph, which it would quantise almost without error; "
                 "train on other photographs, or pass with --crossfit a dictionary built without it"
             )
         assigned[photograph] = unrelated[0]
@@ -118,10 +118,10 @@ def assign_dictionaries(photographs: set[str], candidates: Sequence[Asset], publ
 
 
 def check_dictionary_sizes(assets: set[Asset], sizes: Sequence[int], public: Public) -> None:
-    """Refuse dictionaries of different sizes.
+    """Check that all dictionaries have equal sizes.
 
-    At the same epsilon, fewer words contain the true word more often. A network that reads epsilon would learn a wrong trust in
-    words.
+    At the same epsilon, a set from fewer words contains the true word more often. A network that reads epsilon would learn a
+    wrong trust in words.
 
     Raises
     ------
@@ -133,16 +133,16 @@ def check_dictionary_sizes(assets: set[Asset], sizes: Sequence[int], public: Pub
         if len(set(lengths.values())) > 1:
             listed = ", ".join(f"{asset} {length:,}" for asset, length in sorted(lengths.items()))
             raise UserError(
-                f"--crossfit: dictionaries have different sizes ({listed} words), so at the same epsilon the chance of the true "
-                "word differs; pass dictionaries of equal size, or fix a word count that all of them have"
+                f"--crossfit: dictionaries have different sizes ({listed} words), and so different chances of the true word; "
+                "pass equal sizes, or fix a number of words that all have"
             )
 
 
 class Quantisation:
-    """The nearest words of all rows of a training set, computed once. A `Quantiser` for `Public`."""
+    """Nearest words of all rows of a training set, computed in advance: a `Quantiser` for `Public`."""
 
     def __init__(self, tables: dict[str, tuple[np.ndarray, Indices]]) -> None:
-        self.tables = tables  # dictionary's digest -> ascending keys of rows, words of these rows
+        self.tables = tables  # digest of a dictionary -> ascending keys of rows, words of these rows
 
     def __call__(self, dictionary: Dictionary, rows: Bytes | Floats) -> Indices:
         keys, words = self.tables[dictionary.digest]
@@ -158,7 +158,8 @@ def quantise(
 ) -> Quantisation:
     """Find the nearest words of all descriptors in the dictionary of their photograph, at each of `sizes`.
 
-    Sizes descend, all words (0) first: the nearest of many words is also the nearest of fewer, if it is one of them.
+    `sizes` descend; 0, which stands for all words, comes first. The nearest of many words is also the nearest of fewer words that
+    contain it.
     """
     tables = {}
     total = len(sizes) * sum(len(view.features) for view in views)
@@ -166,7 +167,7 @@ def quantise(
         for asset in sorted(set(dictionaries.values())):
             rows = np.concatenate([select_rows(view.features) for view in views if dictionaries[view.photograph] == asset])
             keys, first = _find_first_occurrences(hash_rows(rows))
-            words = np.full(len(first), np.iinfo(np.int64).max)  # none is dictionary yet
+            words = np.full(len(first), np.iinfo(np.int64).max)  # no word is known yet
             for size in sizes:
                 dictionary = public.dictionary(asset, size)
                 missing = words >= len(dictionary)

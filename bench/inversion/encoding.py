@@ -1,6 +1,6 @@
-"""Encodes releases as network input: one row of numbers per keypoint, with the candidates of a keypoint stacked.
+"""Encoding of releases as network input: one row of numbers per keypoint, with the candidates of the keypoint stacked.
 
-Dense feature maps of 128·m channels (paper, Sec. 5.3) are not built: each keypoint is embedded first and scattered afterwards.
+The paper builds dense feature maps of 128·m channels (Sec. 5.3). Here each keypoint is embedded first and scattered afterwards.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from bench.api import Defense
 from bench.settings import Between, OneOf
 from bench.types import Descriptors, Floats, Release, Subspaces, WordSets
 
-CELL = 4  # pixels: the side of the cells that keypoints are scattered to
-DIRECTIONS = 16  # projected onto subspaces
+CELL = 4  # pixels: the side of a grid cell, to which keypoints are scattered
+DIRECTIONS = 16  # number of fixed directions that are projected onto subspaces
 TYPICAL_SCALE = 4.0  # pixels
 
 
@@ -44,15 +44,15 @@ class EncodedRelease:
         return EncodedRelease(self.values.to(device), self.coordinates.to(device), self.image.to(device), self.batch, self.size)
 
 
-# The input of the network for a keypoint. "released": the release as it is (the paper's stacking: m words in order, or a random
-# origin and basis). "invariant": the same without its random order or basis. "positions": the position alone.
+# Network input for a keypoint. "released": the unchanged release, stacked as in the paper (m words in order, or a random origin
+# and basis). "invariant": the release without its random order or basis. "positions": the position alone.
 Encoding = Literal["invariant", "released", "positions"]
 
 
 def stack(release: Release, encoding: Encoding) -> Floats:
     """Stack the candidates of each keypoint. -> (N, slots, D)
 
-    Word sets are stacked in their released order under both encodings. The network makes the difference: it is invariant or not.
+    Word sets are stacked in their released order under both encodings. For "invariant", the network itself ignores the order.
 
     Raises
     ------
@@ -87,8 +87,8 @@ def _(release: Subspaces) -> Floats:
 def project_directions(release: Subspaces) -> Floats:
     """Project zero and fixed directions onto each subspace D. -> (N, 1 + 16, D)
 
-    The random origin and basis of the defense carry no information, and the origin adds noise as long as the descriptor. These
-    projections depend on D alone. They determine D if it has at most as many dimensions as there are directions.
+    The random origin and basis of the defense carry no information, and the origin adds noise of the descriptor's length. These
+    projections depend on D alone. They determine D if its dimension is at most the number of directions.
     """
     inner = np.einsum("nmd,nd->nm", release.bases, release.origins)
     feet = release.origins - np.einsum("nm,nmd->nd", inner, release.bases)  # (N, D) the point of D nearest to zero
@@ -105,7 +105,7 @@ def _build_directions(length: int) -> Floats:
 
 
 def encode_settings(defense: Defense, supported: Mapping[str, Between | OneOf]) -> Floats:
-    """Scale the public settings of the defense that the network supports to [0, 1]. -> (C,)"""
+    """Return the settings of the defense that the network supports, scaled to [0, 1]. -> (C,)"""
     scaled = []
     for field, settings in sorted(supported.items()):
         value = float(getattr(defense, field))
@@ -122,8 +122,9 @@ def _find_extremes(settings: OneOf) -> tuple[float, float]:
 def encode(releases: list[Release], settings: list[Floats], slots: int, encoding: Encoding) -> EncodedRelease:
     """Encode a batch.
 
-    A keypoint's row holds its stacked candidates, padded with zeros to `slots`; its position within its cell; its scale (octaves)
-    and orientation (cosine, sine) if released; the settings. Keypoints outside the image are moved to its border.
+    The row of a keypoint holds its stacked candidates, padded with zeros to `slots`, and its position within its cell. Its scale
+    (octaves) and orientation (cosine, sine), if released, and the settings follow. Keypoints outside the image are moved to its
+    border.
 
     Raises
     ------

@@ -20,7 +20,7 @@ Loss = Callable[[Tensor, Tensor], Tensor]  # (B, 3, H, W) reconstructions, (B, 3
 
 
 class Learner(Generic[Module]):
-    """Takes training steps. A checkpoint holds its state."""
+    """Executes training steps. Checkpoints store its state."""
 
     def __init__(self, module: Module, training: Training, loss: Loss = reconstruction_loss) -> None:
         self.training, self.loss = training, loss
@@ -36,10 +36,10 @@ class Learner(Generic[Module]):
         self.average = {name: value.clone() for name, value in self.module.state_dict().items()}
 
     def learn(self, points: EncodedRelease, photographs: Tensor, progress: float, parallel: nn.Module | None = None) -> Tensor:
-        """Take one step and return its loss. -> ()
+        """Execute one training step, and return its loss. -> ()
 
-        `progress` is the fraction of the training before this step, after the warm-up. `parallel` is called instead of the
-        network if several processes share the batch.
+        `progress` is the completed fraction of the training after the warm-up. If several processes split the batch, `parallel`
+        is called instead of the network.
         """
         warm = self.training.warmup
         factor = (self.step + 1) / warm if self.step < warm else 0.5 * (1 + math.cos(math.pi * progress))
@@ -53,7 +53,7 @@ class Learner(Generic[Module]):
         torch.nn.utils.clip_grad_norm_(self.module.parameters(), 1.0)
         self.optimizer.step()
         self.step += 1
-        decay = min(self.training.average, self.step / (self.step + 9))  # short memory while the weights still change fast
+        decay = min(self.training.average, self.step / (self.step + 9))  # small at first, while the weights change fast
         for name, weight in self.module.state_dict().items():
             if weight.is_floating_point():
                 self.average[name].lerp_(weight, 1 - decay)

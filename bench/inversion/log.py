@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 class Log:
-    """Writes numbers by name and step for TensorBoard; does nothing if the folder is None."""
+    """Writes numbers by name and step for TensorBoard; writes nothing if the folder is None."""
 
     def __init__(self, folder: Path | None) -> None:
         """Open the log, or continue an existing one.

@@ -37,7 +37,7 @@ def ssim(a: Tensor, b: Tensor) -> Tensor:
 
 
 def reconstruction_loss(reconstruction: Tensor, photograph: Tensor) -> Tensor:
-    """L1 + 0.3 (1 - SSIM). (B, 3, H, W), (B, 3, H, W) -> ()"""
+    """Return L1 + 0.3 (1 - SSIM), with SSIM on luminance. (B, 3, H, W), (B, 3, H, W) -> ()"""
     luma = torch.tensor(LUMA, device=reconstruction.device).view(1, 3, 1, 1)
     similarity = ssim((reconstruction * luma).sum(dim=1), (photograph * luma).sum(dim=1))
     return (reconstruction - photograph).abs().mean() + WEIGHT * (1 - similarity)

@@ -1,10 +1,10 @@
 """The inversion network: an MLP embeds each keypoint, embeddings are scattered to a grid, a U-Net reconstructs the photograph.
 
-A small version of Pittaluga et al. (CVPR 2019) and Dosovitskiy and Brox (CVPR 2016). The grid has one cell per 4 x 4 pixels; the
+A small version of Pittaluga et al. (CVPR 2019) and Dosovitskiy and Brox (CVPR 2016). The grid has one cell per 4 x 4 pixels. The
 position of a keypoint within its cell is an input of its embedding. Coarse levels have most channels. Each keypoint also adds a
-patch around itself, as wide as the support of its descriptor, which convolutions of a sparse map reach only in deep layers.
+patch around itself, as wide as the support of its descriptor. Convolutions of a sparse map reach so far only in deep layers.
 
-Keypoints that share a cell: their embeddings are summed, and an extra channel counts them. Patches are summed as well.
+If several keypoints lie in one cell, their embeddings are summed, and an extra channel counts them. Patches are summed as well.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class Inverter(nn.Module):
 
     def forward(self, points: EncodedRelease) -> Tensor:
         rows, columns = points.grid
-        step = 2 ** len(self.down)  # of the deepest level's grid; images of other sizes get an empty margin
+        step = 2 ** len(self.down)  # cell size of the deepest level; other image sizes get an empty margin
         margin = (0, -columns % step, 0, -rows % step)
         level = self.stem(nnf.pad(self.scatter(points), margin))
         levels = [level]
@@ -84,7 +84,7 @@ class Inverter(nn.Module):
     def scatter_patches(self, hidden: Tensor, points: EncodedRelease) -> Tensor:
         """Sum the patches around keypoints in a grid, without the parts outside the image. -> (B, H/4, W/4, painted)"""
         side, (rows, columns) = self.shape.patch, points.grid
-        corner = (points.coordinates + (side + 1) / 2).long()  # (P, 2) in a grid with a margin, as wide as a patch, on all sides
+        corner = (points.coordinates + (side + 1) / 2).long()  # (P, 2) in a grid with a margin of one patch width on all sides
         steps = torch.arange(side, device=corner.device)
         row, column = corner[:, 1, None, None] + steps[:, None], corner[:, 0, None, None] + steps  # (P, side, 1), (P, 1, side)
         cells = torch.stack(torch.broadcast_tensors(column, row), dim=3).view(-1, 2)
@@ -98,7 +98,7 @@ class Inverter(nn.Module):
         return self.embed_set(points.values) if self.shape.candidates else self.embed(points.values)
 
     def embed_set(self, values: Tensor) -> Tensor:
-        """Embed each candidate with the common inputs, and sum. Their order has no effect. (P, F) -> (P, hidden)"""
+        """Embed each candidate with the common inputs, and sum over candidates in any order. (P, F) -> (P, hidden)"""
         count, length = self.shape.candidates, self.shape.length
         candidates = values[:, : count * length].view(-1, count, length)  # (P, m, D)
         common = values[:, None, count * length :].expand(-1, count, -1)
@@ -128,7 +128,7 @@ class Residual(nn.Module):
 
 
 class Up(nn.Module):
-    """Doubles the resolution and adds the encoder's level of that resolution: half the operations of concatenation."""
+    """Doubles the resolution and adds the encoder's level of that resolution. Concatenation would take twice the operations."""
 
     def __init__(self, wide: int, narrow: int) -> None:
         super().__init__()
@@ -146,7 +146,7 @@ def upsample(level: Tensor) -> Tensor:
 
 
 def sum_by_cell(values: Tensor, image: Tensor, cells: Tensor, shape: tuple[int, int, int]) -> Tensor:
-    """Sum values (P, C) by image and cell (P, 2), column and row, in a grid. -> (*shape, C)"""
+    """Sum values (P, C) by image (P,) and cell (P, 2), which is column and row, in a grid. -> (*shape, C)"""
     batch, rows, columns = shape
     indices = (image * rows + cells[:, 1]) * columns + cells[:, 0]
     return values.new_zeros(batch * rows * columns, values.shape[1]).index_add(0, indices, values).view(*shape, -1)

@@ -1,4 +1,4 @@
-"""A cache of trained networks, by the inputs of their training."""
+"""Cache of trained networks, by the inputs of their training."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def build_key(plan: Plan) -> dict[str, Any]:
 
 
 def fetch(key: dict[str, Any], out: Path) -> dict[str, Any] | None:
-    """Copy the cached network to `out` unless that exists, and return its metadata; None if nothing is cached or `out` exists."""
+    """Copy the cached network to `out`, and return its metadata; None if nothing is cached or `out` exists already."""
     if out.exists() or not store.copy_file(KIND, key, out):
         return None
     return weights.load(out).meta

@@ -9,12 +9,12 @@ from torch import Tensor, distributed, nn
 
 
 class JointBatchNorm2d(nn.BatchNorm2d):
-    """Normalises by mean and variance over the equal parts of all processes. (B, C, H, W) -> the same."""
+    """Batch norm by mean and variance over the batches of all processes, which have equal size. (B, C, H, W) -> the same."""
 
     def forward(self, x: Tensor) -> Tensor:
         if not self.training:
             return super().forward(x)
-        wide = x if x.dtype == torch.float64 else x.float()  # sums over a batch are too long for half precision
+        wide = x if x.dtype == torch.float64 else x.float()  # half precision is too coarse for sums over a batch
         processes = distributed.get_world_size()
         moments = torch.stack([wide.mean(dim=(0, 2, 3)), wide.square().mean(dim=(0, 2, 3))])  # (2, C)
         mean, square = _AllReduceSum.apply(moments) / processes
@@ -37,7 +37,7 @@ class JointBatchNorm2d(nn.BatchNorm2d):
 
 
 class _AllReduceSum(torch.autograd.Function):
-    """The sum of a tensor over all processes. Its gradient is summed over all processes, too."""
+    """Sums a tensor over all processes. The gradient is summed over all processes, too."""
 
     @staticmethod
     def forward(context: Any, part: Tensor) -> Tensor:
@@ -51,7 +51,7 @@ class _AllReduceSum(torch.autograd.Function):
 
 
 def convert_batch_norms(module: nn.Module) -> None:
-    """Convert every batch norm of a module, in place, to one over the batch of all processes."""
+    """Convert every batch norm of a module, in place, to a `JointBatchNorm2d`."""
     for inner in module.modules():
         if type(inner) is nn.BatchNorm2d:
             inner.__class__ = JointBatchNorm2d

@@ -1,7 +1,7 @@
-"""Muon for matrices, AdamW for the rest.
+"""An optimizer: Muon for matrices, AdamW for all other weights.
 
-Muon (Jordan et al., 2024; Liu et al., arXiv 2502.16982) updates a matrix by the orthogonal matrix nearest to
-its averaged gradient, so that all directions move equally far. A convolution is the matrix of its outputs by its inputs.
+Muon (Jordan et al., 2024; Liu et al., arXiv 2502.16982) updates a matrix by the orthogonal matrix nearest to its averaged
+gradient, so that the update has equal length in all directions. A convolution counts as a matrix of outputs by inputs.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 
 class Optimizer:
-    """Muon and AdamW at one rate: Muon's updates are scaled to the usual size of AdamW's."""
+    """Muon and AdamW with one learning rate. Muon's updates are scaled to the usual size of AdamW's."""
 
     def __init__(self, module: nn.Module, rate: float, decay: float) -> None:
         self.weights: dict[str, Tensor] = dict(module.named_parameters())
@@ -42,7 +42,7 @@ class Optimizer:
         self.adamw.step()
 
     def state(self) -> dict[str, Tensor]:
-        """Return the moments of each weight by its name, for `restore`."""
+        """Return the moments of each weight by name, for `restore`."""
         return {
             f"{name}/{key}": value
             for weights, optimizer in self.parts

@@ -1,4 +1,4 @@
-"""The inputs of a training: releases, photographs, sizes and schedule."""
+"""Inputs of a training: releases, photographs, sizes and schedule."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Training:
 
     steps: int = 4000
     batch: int = 8
-    rate: float = 4e-3  # the learning rate at its peak; cosine to zero
+    rate: float = 4e-3  # peak learning rate; decays to zero by a cosine
     warmup: int = 100  # steps
     decay: float = 0.02  # of the weights
     average: float = 0.998  # decay of the moving average of the weights
@@ -29,12 +29,12 @@ class Training:
 
     def __post_init__(self) -> None:
         if self.steps < 1 or self.batch < 1:
-            raise UserError(f"training needs at least one step of one photograph, got {self.steps} of {self.batch}")
+            raise UserError(f"--steps and --batch must be at least 1, got {self.steps} and {self.batch}")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Plan:
-    """One training. No photograph should be in both sets."""
+    """One training. The training set and the validation set must not have a photograph in common."""
 
     defense: Defense  # with its fixed settings
     supported_settings: SupportedSettings  # fields whose settings are drawn at random in training
@@ -42,7 +42,7 @@ class Plan:
     validation: Sequence[Source]
     extractor: Extractor
     crossfit: Sequence[Asset] = ()  # dictionaries for photographs that the defense's own was built from
-    initial_checkpoint: Path | None = None  # a network for such releases or for raw descriptors; random weights if None
+    initial_checkpoint: Path | None = None  # a network for the same kind of releases or for raw descriptors; None: random weights
     encoding: Encoding = "invariant"  # input of the network
     widths: tuple[int, ...] = Shape.widths  # of the network's levels
     training: Training = Training()  # frozen
@@ -58,6 +58,6 @@ class Profile:
 
 PROFILES = {
     "cpu": Profile(),
-    # The paper's network and about as many photographs, each used 40 times: days on a GPU.
+    # The encoder widths of CoarseNet, and 4 million training samples: 40 of each of 100,000 photographs. Days on a GPU.
     "paper": Profile(widths=COARSENET, training=Training(steps=125_000, batch=32, rate=2e-3, warmup=1000, average=0.9998)),
 }

@@ -1,7 +1,7 @@
-"""Processes that train one network, each on its own device and its part of every batch.
+"""A group of processes that train one network: each on its own device, with its part of every batch.
 
-Lightning Fabric starts them; PyTorch's `DistributedDataParallel` averages their gradients. The result is that of one process with
-the whole batch, up to rounding: parts are equal, and batch norm is over the whole batch.
+Lightning Fabric starts them, and PyTorch's `DistributedDataParallel` averages their gradients. All parts have equal size, and
+batch norm uses the whole batch. So the result equals that of one process with the whole batch, up to rounding.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class ProcessGroup:
 
     @property
     def is_main(self) -> bool:
-        """Whether this process writes files and reports."""
+        """Whether this process writes files and shows progress."""
         return self.rank == 0
 
     def assign_indices(self, batch: int) -> range:
@@ -70,14 +70,14 @@ class ProcessGroup:
 
 
 def launch(devices: int, batch: int, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-    """Run function(group, *args, **kwargs) in one process per device and return the first one's result. All must be picklable.
+    """Run function(group, *args, **kwargs) in one process per device, and return the main process's result. All are pickled.
 
     Raises
     ------
     UserError
-        if there are fewer devices, they cannot share the batch equally, or Lightning Fabric is not installed.
+        if there are too few devices, the batch is no multiple of their number, or Lightning Fabric is not installed.
     Exception
-        a `UserError` or `OSError` of the function.
+        any `UserError` or `OSError` of the function.
     """
     if devices == 1:
         return function(ProcessGroup(), *args, **kwargs)

@@ -1,4 +1,4 @@
-"""Inference: reconstructs a photograph from a release with a network, averaged over symmetries."""
+"""Inference: reconstruction of a photograph from a release by a network, averaged over symmetries."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from bench.types import Floats, Release
 def reconstruct_image(
     module: nn.Module, release: Release, symmetries: Sequence[Symmetry], settings: Floats, slots: int, encoding: Encoding
 ) -> Floats:
-    """Return the mean reconstruction over symmetries of the release, each transformed back. -> (H, W, 3) in [0, 1]
+    """Return the mean of the reconstructions from all symmetries of the release, each transformed back. -> (H, W, 3) in [0, 1]
 
     The errors of the network differ between symmetries, and some cancel.
     """
@@ -29,7 +29,7 @@ def reconstruct_image(
 
 @torch.inference_mode()
 def infer(module: nn.Module, points: EncodedRelease) -> Tensor:
-    """Run a network. -> (B, 3, H, W) float32 in [0, 1]
+    """Return the output of a network. -> (B, 3, H, W) float32 in [0, 1]
 
     Deterministic on one machine with a fixed number of threads.
     """

@@ -1,7 +1,7 @@
-"""Releases of the mirrored or rotated photograph, derived from the release of the photograph.
+"""Releases of the mirrored or rotated photograph, computed from the release of the photograph.
 
-Attackers use them in training and average reconstructions over all eight. A gradient histogram of the transformed photograph is a
-permutation of the original one, which the extractor declares; releases are permuted as descriptors are.
+Attackers use them in training, and average the reconstructions over all eight. A gradient histogram of the transformed photograph
+is a permutation of the original histogram. The extractor declares the permutation, and releases are permuted like descriptors.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ class Symmetry:
 
     mirrored: bool
     turns: int  # quarters, counter-clockwise
-    order: Indices | None  # (D,) permutation of a descriptor's components; None: positions alone
+    order: Indices | None  # (D,) permutation of a descriptor's components; None to transform positions alone
 
     def transform_image(self, pixels: Bytes) -> Bytes:
-        """Transform the photograph. (H, W, 3) -> (H, W, 3), or (W, H, 3) for one or three quarter turns"""
+        """Return the transformed photograph. (H, W, 3) -> (H, W, 3), or (W, H, 3) for one or three quarter turns"""
         return np.ascontiguousarray(np.rot90(pixels[:, ::-1] if self.mirrored else pixels, self.turns))
 
     def invert_image(self, image: Tensor) -> Tensor:
-        """Apply the inverse to an image. (3, H, W)"""
+        """Return the inversely transformed image. (3, H, W)"""
         back = image.rot90(-self.turns, (1, 2))
         return back.flip(2) if self.mirrored else back
 
@@ -44,7 +44,7 @@ class Symmetry:
         Raises
         ------
         TypeError
-            if there is a permutation and this kind of release does not support one.
+            if there is a permutation and releases of this type have none.
         """
         if self.order is not None:
             release = _permute(release, self.order, self)

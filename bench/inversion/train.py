@@ -1,7 +1,7 @@
-"""Trains an attacker's network for the releases of one defense.
+"""Training of an attacker's network for the releases of one defense.
 
-Each example is a function of (seed, step, index in the batch) alone, so that a resumed training gives the same network, and
-several processes can share a batch.
+Each example is a function of (seed, step, index in the batch) alone. So a resumed training gives the same network, and several
+processes can split a batch.
 """
 
 from __future__ import annotations
@@ -53,39 +53,39 @@ from bench.types import WordSets
 CHECKPOINT = "inversion-checkpoint"
 CHECKPOINT_EVERY = 250  # steps
 MAX_VALIDATED = 100  # photographs
-MAX_IN_MEMORY = 2000  # photographs, about 6 GB; of more, views are computed on demand
-MAX_COMPARED = 1000  # training photographs whose quantisation error is compared with that on unseen ones
-TOLERANCE = 0.05  # between the quantisation errors on training and on unseen photographs
+MAX_IN_MEMORY = 2000  # photographs, about 6 GB; with more photographs, views are computed on demand
+MAX_COMPARED = 1000  # training photographs for the comparison of quantisation errors
+TOLERANCE = 0.05  # relative difference of the quantisation errors on training and on unseen photographs
 
 
 def train(plan: Plan, out: Path, log: Path | None = None, devices: int = 1) -> dict[str, Any]:
-    """Train a network, resume its training or load the finished one, and return its metadata.
+    """Train a network, or resume its training, or load the finished network; return its metadata.
 
     Parameters
     ----------
-    out : file of the weights; a checkpoint lies beside it until training ends
+    out : file of the weights; until the training ends, a checkpoint is stored beside it
     log : folder for TensorBoard: loss, rate and speed of each step, and the validation scores
-    devices : number of devices that share each batch; the result is the same up to rounding
+    devices : number of devices that split each batch; the result is the same up to rounding
 
     Raises
     ------
     UserError
-        if photographs are in both sets, no photograph is usable, `out` or its checkpoint is of another training, a log is
-        requested and tensorboard is not installed, or there are too few devices.
+        if photographs are in both sets, or none is usable; if `out` or its checkpoint is of another training; if `log` is given
+        and tensorboard is not installed; or if there are too few devices.
     """
     return launch(devices, plan.training.batch, train_worker, plan, out, log)
 
 
 def train_worker(group: ProcessGroup, plan: Plan, out: Path, log: Path | None) -> dict[str, Any]:
-    """Run one process of `train`."""
+    """Execute `train` in one process of the group."""
     writer = Log(log if group.is_main else None)
     defense, extractor, encoding, training = plan.defense, plan.extractor, plan.encoding, plan.training
     shared = {source.content_hash() for source in plan.photographs} & {source.content_hash() for source in plan.validation}
     if shared:
-        raise UserError(f"{len(shared)} photographs are in both the training and the validation set")
+        raise UserError(f"{len(shared)} photographs are in both the training and the validation set; remove them from one set")
     few = len(plan.photographs) <= MAX_IN_MEMORY
     views = collect_views(list(plan.photographs), extractor) if few else LazyViews(plan.photographs, extractor)
-    unseen = collect_views(list(plan.validation), extractor)[::4]  # as they are, at 256 pixels
+    unseen = collect_views(list(plan.validation), extractor)[::4]  # unmirrored, at 256 pixels
     examples, held_out, errors = _build_examples(plan, views, unseen)
     symmetries = POSITION_SYMMETRIES if encoding == "positions" else find_symmetries(extractor)
     examples = dataclasses.replace(examples, symmetries=symmetries)
@@ -130,7 +130,7 @@ def train_worker(group: ProcessGroup, plan: Plan, out: Path, log: Path | None) -
 
 
 def _check_same_training(path: Path, stored: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
-    """Refuse to resume or overwrite another training."""
+    """Raise UserError if a file is of another training."""
     changed = [key for key in expected if stored.get(key) != expected[key]]
     if changed:
         raise UserError(f"{path} is of another training (other {', '.join(changed)}); remove it, or pass another --out")
@@ -156,7 +156,7 @@ def _build_examples(
         Examples(views, defense, supported, assigned, public),
         Examples(unseen, defense, supported, assigned_unseen, plain),
     )
-    compared = views[:: 4 * math.ceil(len(views) / (4 * MAX_COMPARED))]  # as they are, at 256 pixels
+    compared = views[:: 4 * math.ceil(len(views) / (4 * MAX_COMPARED))]  # unmirrored, at 256 pixels
     errors = {
         "training": measure_quantisation_error(compared, assigned, public, sizes[0]),
         "validation": measure_quantisation_error(unseen, assigned_unseen, plain, sizes[0]),
@@ -166,7 +166,7 @@ def _build_examples(
 
 
 def _list_sizes(defense: Defense, supported: SupportedSettings) -> list[int]:
-    """List the sizes of the dictionary in training, all words (0) first, then descending."""
+    """Return the sizes of the dictionary in training: 0, which stands for all words, first, then descending."""
     if defense.word_count_field is None:
         return [0]
     setting = supported.get(defense.word_count_field)
@@ -175,7 +175,7 @@ def _list_sizes(defense: Defense, supported: SupportedSettings) -> list[int]:
 
 
 def check_quantisation(training: float, validation: float) -> None:
-    """Refuse training photographs that the dictionary was built from: such training makes the defense look safer than it is.
+    """Check that the dictionary was not built from the training photographs, which would make the defense look safer than it is.
 
     Raises
     ------
@@ -184,7 +184,7 @@ def check_quantisation(training: float, validation: float) -> None:
     """
     if not abs(training - validation) <= TOLERANCE * validation:
         raise UserError(
-            f"the quantisation error is {training:.4f} on training photographs and {validation:.4f} on unseen ones, which "
+            f"the quantisation error is {training:.4f} on training photographs and {validation:.4f} on unseen ones. They "
             f"differ by more than {TOLERANCE:.0%}, so the network would learn a wrong trust in words. Was the dictionary built "
             "from the training photographs? If not, pass more photographs to --validation"
         )
@@ -204,7 +204,7 @@ def _checkpoint_path(out: Path) -> Path:
 
 
 class _Trainer(Learner[Inverter]):
-    """A learner with its part of the batches and a checkpoint to resume from."""
+    """A learner with its part of each batch, and a checkpoint to resume from."""
 
     def __init__(self, group: ProcessGroup, shape: Shape, training: Training, out: Path, meta: dict[str, Any], log: Log) -> None:
         torch.manual_seed(training.seed)
@@ -220,7 +220,7 @@ class _Trainer(Learner[Inverter]):
         self.reset_average()
 
     def run(self, examples: Examples) -> Inverter:
-        """Train to the end and return the network with averaged weights."""
+        """Train to the end, and return the network with averaged weights."""
         if self.step == self.training.steps:
             return self.load_average()
         with Progress("training", self.training.steps - self.step) as progress:
@@ -238,7 +238,7 @@ class _Trainer(Learner[Inverter]):
         return self.load_average()
 
     def _batches(self, examples: Examples) -> Iterator[tuple[EncodedRelease, Tensor]]:
-        """Yield this process's parts of the batches from the next step on, built ahead in threads."""
+        """Yield this process's parts of the batches from the next step on. Threads build them in advance."""
         training, indices = self.training, self.group.assign_indices(self.training.batch)
 
         def build(step: int) -> tuple[EncodedRelease, Tensor]:
@@ -255,7 +255,7 @@ class _Trainer(Learner[Inverter]):
                 yield batch
 
     def _advance(self, parallel: nn.Module, points: EncodedRelease, photographs: Tensor) -> float:
-        """Take one step of the schedule. -> the loss of the whole batch"""
+        """Execute one step of the schedule. -> the loss of the whole batch"""
         warm = self.training.warmup
         progress = (self.step - warm) / max(1, self.training.steps - warm)
         value = self.group.average(self.learn(points, photographs, progress, parallel))
@@ -294,7 +294,7 @@ def build_batch(examples: Sequence[Example], slots: int, encoding: Encoding) -> 
 def validate(
     module: nn.Module, examples: Examples, views: Sequence[PhotographView], slots: int, encoding: Encoding
 ) -> dict[str, float]:
-    """Return mean MAE, SSIM (where its window fits) and PSNR over whole views, under settings drawn with a fixed seed."""
+    """Return mean MAE, SSIM (where its window fits) and PSNR over whole views. Settings are drawn with a fixed seed."""
     device, rng = pick_device(), np.random.default_rng(0)
     scores = []
     for view in views:

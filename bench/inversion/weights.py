@@ -1,4 +1,4 @@
-"""Networks on disk: half-precision safetensors whose metadata describe the releases that they were trained for."""
+"""Network files: half-precision safetensors, whose metadata describe the releases of the training."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ REQUIRED_METADATA = (
     "serves",
     "shape",
     "slots",
-)  # metadata that inference needs
+)  # metadata for inference
 STAGE_METADATA = ("start", "crops", "batch", "photographs", "rate", "symmetries")  # metadata of each training stage
 
 
@@ -70,7 +70,7 @@ class Network(NetworkFile):
 
 
 def save(path: Path, module: nn.Module, shape: Shape, meta: dict[str, Any]) -> str:
-    """Write the weights in half precision, where they fit into it, and return the file's digest."""
+    """Write the weights, in half precision unless a value overflows, and return the digest of the file."""
     arrays = {
         name: tensor_file.to_half(value.detach().cpu().numpy())
         for name, value in module.state_dict().items()
@@ -107,11 +107,11 @@ def _load(path: Path, version: object) -> Network:
 
 
 def initialise_from(fresh: Inverter, trained: Inverter, candidates: int) -> None:
-    """Initialise a network from one for the same kind of release, or from one for raw descriptors.
+    """Initialise a network from a network for the same kind of release, or for raw descriptors.
 
-    In the second case, the first layer reads the first `candidates` slots as descriptors (the words of a set; the point of a
-    subspace nearest to zero). Weights are divided so that a sum of independent slots keeps its size. The other slots and the
-    settings get weight zero. All other layers are copied.
+    From a network for raw descriptors, the first layer treats the first `candidates` slots as descriptors. These are the words of
+    a set, or the point of a subspace nearest to zero. Weights are divided by √candidates, which preserves the size of a sum of
+    independent slots. The other slots and the settings get weight zero. All other layers are copied.
 
     Raises
     ------
@@ -128,7 +128,7 @@ def _copy_weights(fresh: Inverter, trained: Inverter, candidates: int) -> None:
     first = "embed.0.weight"
     old, new = trained.state_dict(), fresh.state_dict()
     if any(old[name].shape != value.shape for name, value in new.items() if name != first):
-        raise UserError("--initial-checkpoint: that network has other sizes; pass one of equal --widths")
+        raise UserError("--initial-checkpoint: that network has other sizes; pass a network with equal --widths")
     for name, value in new.items():
         if value.shape == old[name].shape:
             value.copy_(old[name])
@@ -138,7 +138,7 @@ def _copy_weights(fresh: Inverter, trained: Inverter, candidates: int) -> None:
     slots = (new[first].shape[1] - 2) // max(1, length)
     if trained.shape.candidates or not length or slots < candidates:
         raise UserError(
-            "--initial-checkpoint: that network reads other releases; pass one for these releases or for raw descriptors"
+            "--initial-checkpoint: that network is for other releases; pass a network for these releases or for raw descriptors"
         )
     new[first].zero_()
     new[first][:, : candidates * length] = (old[first][:, :length] / candidates**0.5).repeat(1, candidates)
@@ -146,12 +146,12 @@ def _copy_weights(fresh: Inverter, trained: Inverter, candidates: int) -> None:
 
 
 def list_training_stages(meta: dict[str, Any]) -> list[dict[str, Any]]:
-    """List the training stages of a network from its metadata, the first stage first."""
+    """Return the training stages of a network from its metadata, the first stage first."""
     return [*meta.get("earlier", []), {key: meta.get(key) for key in STAGE_METADATA}]
 
 
 def describe(defense: Defense, supported: dict[str, Between | OneOf], extractor: Extractor, public: Public) -> dict[str, Any]:
-    """Return the metadata that describe the releases a network is trained for."""
+    """Return the metadata that describe the releases of a training."""
     configuration = spec.to_json_with_digests(defense, public)
     return {
         "defense": {field: value for field, value in configuration.items() if field not in supported},
@@ -161,14 +161,14 @@ def describe(defense: Defense, supported: dict[str, Between | OneOf], extractor:
 
 
 def explain_incompatible(meta: dict[str, Any], defense: Defense, extractor: Extractor, public: Public) -> str | None:
-    """Return why a network was not trained for the releases of `defense`; None if it was."""
+    """Return the reason why a network does not suit the releases of `defense`; None if it was trained for them."""
     if meta["defense"]["name"] != defense.name():
         return f"trained for {meta['defense']['name']}"
     configuration = spec.to_json_with_digests(defense, public)
     for field, text in meta["serves"].items():
         if getattr(defense, field) not in _decode_setting(text):
             return f"trained for {field} {_decode_setting(text)}, not {getattr(defense, field)}"
-    trained = fields.list_defaults(type(defense)) | meta["defense"]  # a field newer than the network had its default
+    trained = fields.list_defaults(type(defense)) | meta["defense"]  # a field added after the training counts as its default
     for field in sorted((configuration.keys() | meta["defense"].keys()) - meta["serves"].keys()):
         if configuration.get(field) != trained.get(field):
             return f"trained for {field} {trained.get(field)}, not {configuration.get(field)}"
@@ -176,7 +176,7 @@ def explain_incompatible(meta: dict[str, Any], defense: Defense, extractor: Extr
 
 
 def explain_other_features(meta: dict[str, Any], extractor: Extractor, public: Public) -> str | None:
-    """Return why a network was not trained for the features of `extractor`; None if it was."""
+    """Return the reason why a network does not suit the features of `extractor`; None if it was trained for them."""
     features = spec.to_json_with_digests(extractor, public)
     for field in sorted(meta["extractor"].keys() | features.keys()):
         if meta["extractor"].get(field) != features.get(field):

@@ -1,1 +1,1 @@
-"""Localization from released features: a map of the references, retrieval, matching, and the pose of the query."""
+"""Localization from released features: map of the references, retrieval, matching, and pose of the query."""

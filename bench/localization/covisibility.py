@@ -1,4 +1,4 @@
-"""Pairs of references to match, selected by their poses alone, as hloc's `pairs_from_poses` does."""
+"""Selection of pairs of references to match, by their poses alone, as in hloc's `pairs_from_poses`."""
 
 from __future__ import annotations
 
@@ -9,17 +9,15 @@ import numpy as np
 from bench.images.scene import Reference
 
 NEIGHBOURS = 20  # per reference
-MAX_ANGLE = 60.0  # degrees between optical axes; beyond it two images have too little in common
+MAX_ANGLE = 60.0  # degrees between optical axes; images with a greater angle have too little in common
 
 
 def select_pairs(
     references: Sequence[Reference], neighbours: int = NEIGHBOURS, max_angle: float = MAX_ANGLE
 ) -> list[tuple[int, int]]:
-    """Pair each reference with its nearest neighbours of similar direction: by the distance of centres, ties to the first.
+    """Return pairs of each reference and its nearest neighbours of similar direction.
 
-    Returns
-    -------
-    Pairs (a, b) with a < b, ascending, each once.
+    Neighbours are nearest by the distance of camera centres, ties to the first. Pairs (a, b) have a < b, ascend, and occur once.
     """
     centres = np.array([image.cam_from_world.inverse().translation for image in references])  # (V, 3)
     axes = np.array([image.cam_from_world.rotation.matrix()[2] for image in references])  # (V, 3)

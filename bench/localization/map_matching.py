@@ -1,7 +1,7 @@
-"""Matches between keypoints of a release and points of the map. The release's type decides which matcher applies.
+"""Matches between keypoints of a release and points of the map. The type of the release determines the matcher.
 
-All but `Vocabulary` match the release with one retrieved reference at a time, as COLMAP and hloc match pairs of images. They
-return mutually nearest neighbours that have a point in the map. `two_view_matching` matches two images without a map.
+All matchers except `Vocabulary` match the release with one retrieved reference at a time, as COLMAP and hloc match pairs of
+images. They return mutually nearest neighbours with a point in the map. `two_view_matching` matches two images without a map.
 """
 
 from __future__ import annotations
@@ -36,18 +36,18 @@ class RetrievedReferences:
 
     @property
     def rows(self) -> Indices:
-        """The keypoints of those references, as rows of the map."""
+        """Keypoints of those references, as rows of the map."""
         parts = [np.arange(self.map.starts[each], self.map.starts[each + 1]) for each in self.references]
         return np.concatenate(parts) if parts else np.empty(0, dtype=np.int64)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Correspondences:
-    """C pairs of a keypoint of the release and a point of the map, each pair once, by keypoint and then by point."""
+    """C distinct pairs of a keypoint of the release and a point of the map, sorted by keypoint and then by point."""
 
     keypoints: Indices  # (C,) of the release
     points: Indices  # (C,) of the map
-    rows: Indices  # (C,) the map's keypoint that gave the pair; the first, if there are several
+    rows: Indices  # (C,) the keypoint of the map that gave the pair; the first one if there are several
 
     def __len__(self) -> int:
         return len(self.keypoints)
@@ -58,18 +58,18 @@ class Matcher(ABC):
 
     release_types: ClassVar[tuple[type[Release], ...]]
     needs_words: ClassVar[bool] = False  # whether it needs the words of the map's keypoints
-    needs_noise: ClassVar[bool] = False  # whether it applies only to defenses that add strong noise
+    needs_noise: ClassVar[bool] = False  # whether it applies to defenses with strong noise only
 
     @abstractmethod
     def match(self, release: Release, retrieved: RetrievedReferences) -> Correspondences:
-        """Match a release. Raises TypeError if the release is of another type."""
+        """Return the correspondences of a release. Raises TypeError if the release is of another type."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Vocabulary(Matcher):
     """Matches a keypoint with every point, in any of the references, whose word is one of the keypoint's words.
 
-    With about as many words as retrieved points, few words have more than one point.
+    If the dictionary has about as many words as there are retrieved points, few words have more than one point.
     """
 
     release_types = (WordSets,)
@@ -112,7 +112,7 @@ class MutualNN(Matcher):
 
 @dataclass(frozen=True, kw_only=True)
 class NoisyNN(MutualNN):
-    """The same without Lowe's test: under strong noise, nearest and second nearest are about equally far away."""
+    """`MutualNN` without Lowe's test: under strong noise, the nearest and the second nearest have about equal distances."""
 
     release_types = (Descriptors,)
     needs_noise = True
@@ -122,7 +122,7 @@ class NoisyNN(MutualNN):
 
 @dataclass(frozen=True, kw_only=True)
 class PointToSubspace(Matcher):
-    """Matches what is mutually nearest by the distance from a descriptor to a subspace (Dusmanu et al., CVPR 2021)."""
+    """Matches mutually nearest descriptors and subspaces, by point-to-subspace distance (Dusmanu et al., CVPR 2021)."""
 
     release_types = (Subspaces,)
 
@@ -139,9 +139,9 @@ class PointToSubspace(Matcher):
 
 @dataclass(frozen=True, kw_only=True)
 class SubspaceToSubspace(Matcher):
-    """Matches what is mutually nearest by the distance of two subspaces; references are lifted too (Dusmanu et al., CVPR 2021).
+    """Matches mutually nearest subspaces, by the distance of two subspaces (Dusmanu et al., CVPR 2021).
 
-    Less accurate than `PointToSubspace`; for servers that hold no descriptors either.
+    References are lifted, too. It is less accurate than `PointToSubspace`, and is for servers that hold no descriptors.
     """
 
     release_types = (Subspaces,)
@@ -165,7 +165,7 @@ MATCHERS: dict[str, type[Matcher]] = {
 
 
 def explain_not_applicable(name: str, defense: Defense) -> str | None:
-    """Explain why that matcher does not apply to the defense's releases; None if it does."""
+    """Return the reason why a matcher does not apply to the defense's releases; None if it applies."""
     matcher = MATCHERS[name]
     if not issubclass(defense.releases, matcher.release_types):
         types = " or ".join(kind.__name__ for kind in matcher.release_types)
@@ -178,12 +178,12 @@ def explain_not_applicable(name: str, defense: Defense) -> str | None:
 
 
 def select_matcher(defense: Defense) -> str | None:
-    """Return the first matcher that applies; None if none does."""
+    """Return the name of the first matcher that applies; None if there is none."""
     return next((name for name in MATCHERS if explain_not_applicable(name, defense) is None), None)
 
 
 def deduplicate(keypoints: Indices, rows: Indices, scene_map: Map) -> Correspondences:
-    """Turn pairs of a keypoint and a row of the map into pairs of a keypoint and a point, each once."""
+    """Return distinct pairs of a keypoint and a point, from pairs of a keypoint and a row of the map."""
     keep = scene_map.points[rows] >= 0
     keypoints, rows = keypoints[keep], rows[keep]
     pairs, first = np.unique(np.stack([keypoints, scene_map.points[rows]], axis=1), axis=0, return_index=True)
@@ -191,7 +191,7 @@ def deduplicate(keypoints: Indices, rows: Indices, scene_map: Map) -> Correspond
 
 
 def _load_descriptors(retrieved: RetrievedReferences, reference: int) -> Tensor:
-    """Load the descriptors of a reference. -> (R, D)"""
+    """Return the descriptors of a reference. -> (R, D)"""
     import torch
 
     return torch.from_numpy(retrieved.map.descriptors[retrieved.map.rows(reference)]).to(pick_device())
@@ -200,7 +200,7 @@ def _load_descriptors(retrieved: RetrievedReferences, reference: int) -> Tensor:
 def _match_mutually(
     retrieved: RetrievedReferences, squared_distances: Callable[[int], Tensor], ratio: float
 ) -> tuple[Indices, Indices]:
-    """Match the n released rows with the keypoints of each reference that are mutually nearest, one reference after the other.
+    """Return mutually nearest pairs of the n released rows and the keypoints of each reference, reference by reference.
 
     `squared_distances` maps a reference of R keypoints to (n, R). -> (P,) released rows, (P,) rows of the map
     """

@@ -1,7 +1,7 @@
-"""Builds the map of a scene: matches among neighbouring references, and points triangulated from their known poses.
+"""Construction of the map of a scene: matches among neighbouring references, and points triangulated from their known poses.
 
-A match counts if it agrees with the poses: COLMAP's Sampson error is at most `EPIPOLAR` pixels. These matches go through
-`pycolmap.Database` to COLMAP's triangulation, in one thread and with a fixed seed, so that the same images give the same map.
+A match counts if it agrees with the poses: COLMAP's Sampson error is at most `EPIPOLAR` pixels. COLMAP reads these matches from a
+`pycolmap.Database` and triangulates them. It uses one thread and a fixed seed, so that the same images give the same map.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ Matches = dict[tuple[int, int], Indices]  # references a < b -> (M, 2) keypoints
 
 
 def build_map(references: Sequence[Reference], features: Sequence[Features]) -> Map:
-    """Build the map of references from their features.
+    """Return the map of references, built from their features.
 
     Raises
     ------
@@ -73,7 +73,7 @@ def verify_matches(
 
 
 def triangulate(references: Sequence[Reference], features: Sequence[Features], matches: Matches) -> tuple[Indices, np.ndarray]:
-    """Triangulate with COLMAP. -> (T,) point of each keypoint of all references, or -1; (P, 3)"""
+    """Return the points that COLMAP triangulates. -> (T,) point of each keypoint of all references, or -1; (P, 3)"""
     import pycolmap
 
     with tempfile.TemporaryDirectory() as scratch, silence_colmap():
@@ -92,7 +92,7 @@ def triangulate(references: Sequence[Reference], features: Sequence[Features], m
 
 
 def _match_pairs(features: Sequence[Features], pairs: Sequence[tuple[int, int]]) -> Iterable[tuple[tuple[int, int], Indices]]:
-    """Match mutually nearest descriptors of each pair of references."""
+    """Yield the mutually nearest descriptors of each pair of references."""
     import torch
 
     device = pick_device()
@@ -106,7 +106,7 @@ def _match_pairs(features: Sequence[Features], pairs: Sequence[tuple[int, int]])
 def _write_database(
     database: Path, references: Sequence[Reference], features: Sequence[Features], matches: Matches
 ) -> pycolmap.Reconstruction:
-    """Return a model with poses and no points, and fill the database for COLMAP's triangulation. Numbers count from 1."""
+    """Write the database for COLMAP's triangulation, and return a model with poses and no points. Numbers count from 1."""
     import pycolmap
 
     model = pycolmap.Reconstruction()
@@ -130,5 +130,5 @@ def _write_database(
 
 
 def _compute_rays(reference: Reference, features: Features) -> np.ndarray:
-    """Project the keypoints to the plane at depth one. -> (N, 2) float64"""
+    """Return the keypoints projected to the plane at depth one. -> (N, 2) float64"""
     return np.asarray(reference.camera.cam_from_img(features.keypoints.astype(np.float64)))

@@ -1,8 +1,8 @@
-"""The pose of a query with fixed intrinsics, from matches of its keypoints with points: P3P in LO-RANSAC, then refined.
+"""Pose estimation with fixed intrinsics, from matches of keypoints with points: P3P in LO-RANSAC, then refinement.
 
 PoseLib (Larsson, 2020) runs as many trials as COLMAP in less than half the time, finds as many poses, and reports its number of
-trials. COLMAP caps its trials by `min_inlier_ratio` without a message, and does not report their number. Here the ratio is so
-small that the cap is never reached, and COLMAP runs all trials allowed.
+trials. COLMAP limits its trials by `min_inlier_ratio` without a message, and does not report their number. Here the ratio is so
+small that this limit is never reached, and COLMAP runs all allowed trials.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ Solver = Literal["poselib", "pycolmap"]
 MAX_ERROR = 12.0  # pixels of reprojection; COLMAP's and hloc's
 CONFIDENCE = 0.9999  # RANSAC stops when the chance that it missed the best pose is below one minus this
 MULTIPLIER = 3.0  # COLMAP's and PoseLib's, of the trials that `CONFIDENCE` needs
-MIN_TRIALS = 1000  # if so many are allowed
-MIN_MATCHES = 4  # P3P takes 3, and the fourth selects among its solutions
+MIN_TRIALS = 1000  # unless fewer are allowed
+MIN_MATCHES = 4  # P3P uses 3, and the fourth selects among its solutions
 NO_CAP = 1e-9  # min_inlier_ratio
 # Camera models that PoseLib shares with COLMAP. It accepts unknown models without an error, and returns wrong poses.
 POSELIB_MODELS = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"}
 
-ROUNDS = 3  # of fitting a focal length and selecting inliers again
+ROUNDS = 3  # of the fit of a focal length and a new selection of inliers
 MIN_FOCAL_MISMATCH = 0.05  # fraction of the focal length
 MIN_F_STATISTIC = 100.0  # of one more parameter: ten standard errors; a wall that faces the camera reached 51 in the gallery
 
@@ -48,13 +48,13 @@ class Estimate:
 def estimate(
     xy: Doubles, xyz: Doubles, camera: pycolmap.Camera, *, trials: int, seed: int, solver: Solver = "poselib"
 ) -> Estimate | None:
-    """Estimate the pose with most inliers, refined on them; None below `MIN_MATCHES` matches, or if RANSAC finds none.
+    """Return the pose with most inliers, refined on them; None below `MIN_MATCHES` matches, or if RANSAC finds no pose.
 
     Parameters
     ----------
     xy, xyz : (C, 2) pixels and (C, 3) in the map's unit of length
-    trials : at most
-    solver : for a camera model that PoseLib does not know, COLMAP's in any case
+    trials : largest number of trials
+    solver : for a camera model that PoseLib does not support, COLMAP's solver is used in any case
 
     Raises
     ------
@@ -70,13 +70,13 @@ def estimate(
 
 
 def compute_errors(estimated: pycolmap.Rigid3d, truth: pycolmap.Rigid3d) -> tuple[float, float]:
-    """Compute the error of the camera's centre, in the map's unit of length, and of its rotation, in degrees."""
+    """Return the error of the camera's centre, in the map's unit of length, and of its rotation, in degrees."""
     offset = estimated.inverse().translation - truth.inverse().translation
     return float(np.linalg.norm(offset)), float(np.degrees(estimated.rotation.angle_to(truth.rotation)))
 
 
 def compute_reprojection_errors(pose: pycolmap.Rigid3d, camera: pycolmap.Camera, xy: Doubles, xyz: Doubles) -> Doubles:
-    """Compute the distance from each projected point to its keypoint, in pixels; infinite behind the camera. -> (C,)"""
+    """Return the distance from each projected point to its keypoint, in pixels; infinite behind the camera. -> (C,)"""
     in_camera = pose * xyz  # (C, 3)
     before = in_camera[:, 2] > 0
     errors = np.full(len(xy), np.inf)
@@ -86,11 +86,12 @@ def compute_reprojection_errors(pose: pycolmap.Rigid3d, camera: pycolmap.Camera,
 
 
 def estimate_focal_mismatch(xy: Doubles, xyz: Doubles, camera: pycolmap.Camera, estimated: Estimate) -> float | None:
-    """Estimate the focal length from the inliers, relative to the camera's; None unless the two clearly differ.
+    """Return the focal length estimated from the inliers, relative to the camera's; None unless the two clearly differ.
 
-    The focal length is refined on the inliers, which are then selected again, `ROUNDS` times. It clearly differs if it is off by
-    more than `MIN_FOCAL_MISMATCH` and its F statistic is above `MIN_F_STATISTIC`: the sum of squares that it saves, over the rest
-    per degree of freedom. Few matches, and matches on a plane that faces the camera, give None.
+    The focal length is refined on the inliers, which are then selected again, `ROUNDS` times. It clearly differs if the relative
+    difference exceeds `MIN_FOCAL_MISMATCH` and the F statistic exceeds `MIN_F_STATISTIC`. The F statistic is the decrease of the
+    sum of squares, divided by the remaining sum per degree of freedom. Few matches give None, as do matches on a plane that faces
+    the camera.
     """
     import pycolmap
 

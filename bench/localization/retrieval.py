@@ -1,7 +1,7 @@
-"""Retrieval of similar references by bags of words, weighted by tf-idf (Sivic & Zisserman, ICCV 2003).
+"""Retrieval of similar references by bags of words with tf-idf weights (Sivic and Zisserman, ICCV 2003).
 
 With the nearest words of raw descriptors, the ranking is the same for all defenses, as in the paper. With the words of a release,
-it leaks nothing beyond the release.
+the ranking leaks nothing beyond the release.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Bags:
 
     @cached_property
     def weights(self) -> NDArray[np.float64]:
-        """log(V / references with the word), 0 for a word that none has. -> (K,)"""
+        """log(V / number of references with the word), 0 for a word in no reference. -> (K,)"""
         count = len(self.starts) - 1
         frequencies = np.asarray((self._counts > 0).sum(axis=0)).ravel()  # (K,)
         return np.where(frequencies > 0, np.log(count / np.maximum(frequencies, 1)), 0.0)

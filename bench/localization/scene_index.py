@@ -1,4 +1,4 @@
-"""The server's index of a scene: features of the reference images, and the map and the dictionaries built from them."""
+"""The server's index of a scene: features of the reference images, and the map and dictionaries built from them."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ SEED = 0  # of the clustering
 
 
 class SceneIndex:
-    """Everything built from the references of a scene: each part on first use, then cached on disk."""
+    """Data built from the references of a scene. Each part is built at first use and cached on disk."""
 
     def __init__(self, scene: Scene, extractor: Extractor) -> None:
-        self.scene = dataclasses.replace(scene, queries=())  # attackers read this, and a query is the secret
+        self.scene = dataclasses.replace(scene, queries=())  # attackers read the index, and a query is the secret
         self.extractor = extractor
         self._words: dict[str, Indices] = {}  # by the dictionary's digest
         self._bags: dict[str, Bags] = {}
@@ -83,9 +83,9 @@ class SceneIndex:
         return tuple(feature_cache.extract_all(self.extractor, [image.pixels for image in self.scene.references]))
 
     def build_dictionary(self, words: int) -> Dictionary:
-        """Cluster that many words from the references' descriptors; `WORDS` for 0.
+        """Return a dictionary of `words` words (0: `WORDS`), clustered from the references' descriptors.
 
-        Where the extractor's limit on keypoints leaves too few descriptors, the limit is dropped.
+        If the extractor's limit on keypoints leaves too few descriptors, the limit is dropped.
 
         Raises
         ------
@@ -108,11 +108,11 @@ class SceneIndex:
         return {"words": words}, meta
 
     def _collect_codes(self, extractor: Extractor) -> Bytes:
-        """Collect the descriptors of all references. -> (n, D)"""
+        """Return the 8-bit descriptors of all references. -> (n, D)"""
         all_codes = [
             features.codes for features in feature_cache.extract_all(extractor, [image.pixels for image in self.scene.references])
         ]
         codes = [each for each in all_codes if each is not None]
         if len(codes) < len(all_codes):
-            raise UserError(f"{extractor.name()} gives no 8-bit descriptors, from which a dictionary's words are clustered")
+            raise UserError(f"{extractor.name()} gives no 8-bit descriptors, which a dictionary of the references needs")
         return np.concatenate(codes)

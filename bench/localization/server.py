@@ -1,4 +1,4 @@
-"""The server: retrieves references for a release, matches the release with them, and estimates the client's pose."""
+"""The server: retrieval of references for a release, matching, and estimation of the client's pose."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from bench.types import Bytes, Descriptors, Features, Floats, Indices, Points, R
 if TYPE_CHECKING:
     import pycolmap
 
-RETRIEVAL_WORDS = 16_000  # for retrieval by descriptors, if the references have four times as many keypoints
+RETRIEVAL_WORDS = 16_000  # for retrieval by descriptors; at most a quarter of the number of keypoints of the references
 CHECK_TRIALS = 1000  # of RANSAC on raw features, most of whose matches are correct
 
 
@@ -32,15 +32,15 @@ class LocalizationResult:
     """The correspondences and the pose of one release."""
 
     correspondences: Correspondences
-    estimate: Estimate | None  # None where there were too few correspondences, or no pose
+    estimate: Estimate | None  # None if there are too few correspondences, or no pose
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Server:
-    """The localization service, as one client uses it."""
+    """The localization service for one client."""
 
     public: Public
-    camera: pycolmap.Camera  # of the client: intrinsics are sent with the release
+    camera: pycolmap.Camera  # of the client, who sends the intrinsics with the release
 
     @property
     def scene_index(self) -> SceneIndex:
@@ -57,11 +57,11 @@ class Server:
         return self.public.dictionary(getattr(defense, defense.dictionary_field), words)
 
     def retrieve_by_query(self, query: Features, count: int = TOP) -> Indices:
-        """Retrieve the references most similar to a query's raw descriptors: the same for every defense. -> (count,)"""
+        """Return the references most similar to a query's raw descriptors, the same for every defense. -> (count,)"""
         return self._rank_references(query.descriptors if query.codes is None else query.codes, count)
 
     def retrieve_by_release(self, release: Release, defense: Defense, count: int = TOP) -> Indices:
-        """Retrieve the references most similar to a release, from the release alone. -> (count,)"""
+        """Return the references most similar to a release, from the release alone. -> (count,)"""
         dictionary = self.find_dictionary(defense)
         if isinstance(release, WordSets) and release.words is not None and dictionary is not None:
             return self.scene_index.build_bags(dictionary).rank(release.words, count)
@@ -70,13 +70,13 @@ class Server:
     def localize(
         self, release: Release, defense: Defense | None, references: Indices, matcher: str, trials: int, seed: int
     ) -> LocalizationResult:
-        """Match a release with references, and estimate the pose of its camera.
+        """Match a release with references, and return the correspondences and the pose of the camera.
 
         Parameters
         ----------
         defense : of the release, for matchers that need words or lifted references
         matcher : one of map_matching.MATCHERS that applies to the release
-        trials : of RANSAC, at most
+        trials : largest number of RANSAC trials
         """
         method = map_matching.MATCHERS[matcher]()
         dictionary = self.find_dictionary(defense) if method.needs_words and defense is not None else None
@@ -91,7 +91,7 @@ class Server:
         return LocalizationResult(correspondences=correspondences, estimate=estimate)
 
     def estimate_focal_mismatch(self, query: Features) -> float | None:
-        """Estimate the focal length from a query's raw features, relative to the camera's; None unless they clearly differ."""
+        """Return the focal length estimated from raw features, relative to the camera's; None unless they clearly differ."""
         raw = Descriptors(positions=Points(keypoints=query.keypoints), size=query.size, descriptors=query.descriptors)
         result = self.localize(raw, None, self.retrieve_by_query(query), "mutual-nn", CHECK_TRIALS, seed=0)
         if result.estimate is None:
@@ -99,7 +99,7 @@ class Server:
         return pose.estimate_focal_mismatch(*self._gather_points(raw, result.correspondences), self.camera, result.estimate)
 
     def _lift_reference(self, defense: Defense, reference: int) -> Subspaces:
-        """Lift the keypoints of a reference with that defense. The result does not depend on the client's seed."""
+        """Return the keypoints of a reference, lifted with that defense. The result does not depend on the client's seed."""
         rng = derive_generator(
             "lifted reference", self.scene_index.digest, reference, spec.to_json_with_digests(defense, self.public)
         )
@@ -109,7 +109,7 @@ class Server:
         return subspaces
 
     def _gather_points(self, release: Release, pairs: Correspondences) -> tuple[np.ndarray, np.ndarray]:
-        """Gather pixels and points. -> (C, 2), (C, 3) float64"""
+        """Return pixels and 3D points. -> (C, 2), (C, 3) float64"""
         return release.keypoints[pairs.keypoints].astype(np.float64), self.scene_index.map.xyz[pairs.points]
 
     def _rank_references(self, descriptors: Bytes | Floats, count: int) -> Indices:
@@ -118,7 +118,7 @@ class Server:
 
 
 def extract_descriptors(release: Release) -> Floats:
-    """Return the descriptors of a release, all its candidates, or the best guess of each subspace. -> (R, D)
+    """Return the descriptors of a release, or all its candidates, or the best guess for each subspace. -> (R, D)
 
     Raises
     ------

@@ -1,6 +1,6 @@
 """Matches between the releases of two images: by words, by descriptors, or by the distance of subspaces.
 
-Word sets match where they have a word in common. All else matches where it is mutually nearest: two descriptors, a descriptor
+Word sets match if they have a common word. All other releases match if they are mutually nearest: two descriptors, a descriptor
 and a subspace, or two subspaces (Dusmanu et al., CVPR 2021). Each candidate of a word set without a dictionary counts as a
 descriptor. `map_matching` matches a release with the points of a map.
 """
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 def prepare_unprotected(features: Features, defense: Defense, public: Public) -> Release:
-    """Prepare raw features for matching with a release of that defense: quantise them if it releases words."""
+    """Return raw features as a release to match with one of that defense. They are quantised if it releases words."""
     if defense.dictionary_field is None:
         return Descriptors(positions=Points(keypoints=features.keypoints), size=features.size, descriptors=features.descriptors)
     asset = fields.list_assets(defense)[defense.dictionary_field]
@@ -39,12 +39,12 @@ def prepare_unprotected(features: Features, defense: Defense, public: Public) ->
 
 
 def match_releases(first: Release, second: Release, ratio: float = 1.0, unique: bool = False) -> Indices:
-    """Match keypoints i of the first release and j of the second. -> (M, 2) distinct pairs, ascending
+    """Return matches of keypoints i of the first release and j of the second. -> (M, 2) distinct pairs, ascending
 
     Parameters
     ----------
     ratio : of Lowe's test, for mutually nearest pairs; 1 disables it
-    unique : whether only words count that occur once in each image
+    unique : whether to ignore words that occur more than once in an image
 
     Raises
     ------
@@ -59,7 +59,7 @@ def match_releases(first: Release, second: Release, ratio: float = 1.0, unique: 
 
 
 def _compute_squared_distances(first: Release, second: Release) -> Tensor:
-    """Compute squared distances between everything in the one release and everything in the other."""
+    """Return squared distances between all descriptors or subspaces of one release and those of the other."""
     if isinstance(first, Subspaces) and isinstance(second, Subspaces):
         return subspaces_to_subspaces(first, second)
     if isinstance(first, Subspaces):
@@ -70,7 +70,7 @@ def _compute_squared_distances(first: Release, second: Release) -> Tensor:
 
 
 def _load_descriptors(release: Release) -> Tensor:
-    """Load descriptors or candidates. -> (N or N m, D)"""
+    """Return descriptors or candidates. -> (N or N m, D)"""
     import torch
 
     if isinstance(release, Descriptors):
@@ -83,5 +83,5 @@ def _load_descriptors(release: Release) -> Tensor:
 
 
 def _count_descriptors(release: Release) -> int:
-    """Count the descriptors of each keypoint."""
+    """Return the number of descriptors per keypoint."""
     return release.subset_size if isinstance(release, WordSets) else 1

@@ -39,13 +39,13 @@ class SubsetYield:
     """Statistics of sets of one size."""
 
     size: int  # m
-    inclusion: float  # the probability that a set contains the true word
-    true_words: float  # in all sets of one release, on average
-    bits: float  # of information in a set about the true word
+    inclusion: float  # probability that a set contains the true word
+    true_words: float  # expected number of true words in all sets of one release
+    bits: float  # information of a set about the true word
 
 
 def divide_budget(image: float, keypoints: int, releases: int, words: int) -> Budget:
-    """Divide an ε among the descriptors of a photograph, each released `releases` times.
+    """Return the ε of a descriptor: that of a photograph divided among its descriptors, each released `releases` times.
 
     Raises
     ------
@@ -55,9 +55,9 @@ def divide_budget(image: float, keypoints: int, releases: int, words: int) -> Bu
     if not image >= 0:
         raise UserError(f"--image-epsilon: must be at least 0, got {image}")
     if keypoints < 1 or releases < 1:
-        raise UserError(f"a photograph has at least 1 keypoint and is released at least once, got {keypoints} and {releases}")
+        raise UserError(f"--keypoints and --releases must be at least 1, got {keypoints} and {releases}")
     if words < 2:
-        raise UserError(f"--words: a dictionary has at least 2 words, not {words}")
+        raise UserError(f"--words: must be at least 2, got {words}")
     answers = keypoints * releases
     return Budget(
         image,
@@ -70,7 +70,7 @@ def divide_budget(image: float, keypoints: int, releases: int, words: int) -> Bu
 
 
 def compute_yields(plan: Budget) -> list[SubsetYield]:
-    """Compute the yield at the ε of a descriptor, for a few sizes and the best ones."""
+    """Return the yield at the ε of a descriptor, for a few sizes and the best ones."""
     optima = most_accurate_size(plan.epsilon, plan.words), most_informative_size(plan.epsilon, plan.words)
     sizes = sorted({*(size for size in SIZES if size < plan.words), *optima})
     bits = mutual_information(plan.epsilon, plan.words, np.array(sizes)) / math.log(2)
@@ -82,12 +82,12 @@ def compute_yields(plan: Budget) -> list[SubsetYield]:
 
 
 def select_nearest_records(records: Sequence[Mapping[str, Any]], epsilon: float) -> list[Mapping[str, Any]]:
-    """Select the records whose ε of a descriptor is nearest.
+    """Return the records whose ε of a descriptor is nearest to `epsilon`.
 
     Raises
     ------
     UserError
-        if no record claims one.
+        if no record has a guarantee.
     """
     claims = [record["privacy"]["epsilon_descriptor"] for record in records]
     distances = np.abs(np.array([math.nan if value is None else float(value) for value in claims]) - epsilon)
@@ -119,7 +119,7 @@ def report(plan: Budget) -> Iterator[Table | str]:
     ]
     columns = ("words in a set", "Pr(true)", "Pr(a word of it is true)", "true words in all", "bits")
     remark = (
-        "Pr(a word of it is true): the chance that a guess is right, for an attacker and for a matching server; "
+        "Pr(a word of it is true): the chance that a guess of an attacker or a matching server is right; "
         f"without any release it is {1 / plan.words:.3g}.\n"
         "* most information about the true word † most accurate word frequencies"
     )

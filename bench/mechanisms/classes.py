@@ -1,9 +1,10 @@
 """Exact draws of classes whose chances have ratios of integers times powers of e: no step is rounded.
 
 Pr(class j) = n_j e^(a_j) / Σ_i n_i e^(a_i) for integers n_j ≥ 0 and fractions a_j. A uniform number in [0, 1) falls between two
-of the cumulated chances; both are read bit by bit, as many bits as necessary. A cumulated chance is rational if all non-empty
-classes have one power, or if it covers none or all of them. Otherwise it is irrational: e to distinct algebraic powers are
-linearly independent over the algebraic numbers (Lindemann and Weierstrass). A finite precision then determines its digits.
+of the cumulated chances. The number and the chances are compared bit by bit, with as many bits as necessary. A cumulated chance
+is rational if all non-empty classes have one power, or if it covers none or all of them. Otherwise it is irrational, because e to
+distinct algebraic powers are linearly independent over the algebraic numbers (Lindemann and Weierstrass). A finite precision then
+determines its digits.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ WIDTH = 64  # bits compared in one step
 def draw_classes(
     profiles: Sequence[Sequence[int]], powers: Sequence[Fraction], which: Indices, rng: np.random.Generator
 ) -> Indices:
-    """Draw a class for each row.
+    """Return a random class for each row.
 
     Parameters
     ----------
@@ -51,7 +52,7 @@ def draw_classes(
 
 
 def _refine_draw(counts: Sequence[int], powers: Sequence[Fraction], number: int, rng: np.random.Generator) -> int:
-    """Extend a number whose first bits may equal those of an edge, and return its class."""
+    """Draw further bits of a number until it differs from all edges, and return its class."""
     bits = WIDTH
     while number in (limits := edges(counts, powers, bits)):
         number = number << WIDTH | int(rng.integers(2**WIDTH - 1, dtype=np.uint64, endpoint=True))
@@ -60,7 +61,7 @@ def _refine_draw(counts: Sequence[int], powers: Sequence[Fraction], number: int,
 
 
 def edges(counts: Sequence[int], powers: Sequence[Fraction], bits: int) -> list[int]:
-    """floor(2^bits · Pr(one of the first j classes)) for j = 1, ..., J − 1, exactly."""
+    """Return floor(2^bits · Pr(one of the first j classes)) for j = 1, ..., J − 1, exactly."""
     filled = [power for count, power in zip(counts, powers, strict=True) if count]
     if len(set(filled)) == 1:
         return [(below << bits) // sum(counts) for below in list(accumulate(counts))[:-1]]
@@ -74,7 +75,7 @@ def edges(counts: Sequence[int], powers: Sequence[Fraction], bits: int) -> list[
 
 
 def _enclose_edges(counts: Sequence[int], weights: Sequence[tuple[int, int]], bits: int) -> list[int] | None:
-    """Return the edges, or None if these bounds of the classes' weights do not determine them."""
+    """Return the edges; None if these bounds of the classes' weights do not determine them."""
     low = list(accumulate(count * least for count, (least, _) in zip(counts, weights, strict=True)))
     high = list(accumulate(count * most for count, (_, most) in zip(counts, weights, strict=True)))
     left = list(accumulate(counts))
@@ -85,7 +86,7 @@ def _enclose_edges(counts: Sequence[int], weights: Sequence[tuple[int, int]], bi
             continue
         floor = (low[index] << bits) // (low[index] + high[-1] - high[index])
         ceiling = (high[index] << bits) // (high[index] + low[-1] - low[index])
-        if floor != min(ceiling, (1 << bits) - 1):  # below 1, although the weight of the next classes may be below the precision
+        if floor != min(ceiling, (1 << bits) - 1):  # below 1, even if the weight of the next classes is below the precision
             return None
         limits.append(floor)
     return limits
@@ -93,12 +94,12 @@ def _enclose_edges(counts: Sequence[int], weights: Sequence[tuple[int, int]], bi
 
 @lru_cache(maxsize=256)
 def exponentials(powers: tuple[Fraction, ...], precision: int) -> list[tuple[int, int]]:
-    """Integers below and above 2^precision · e^a, for each a ≤ 0."""
+    """Return integers below and above 2^precision · e^a, for each a ≤ 0."""
     return [_exponential(power, precision) for power in powers]
 
 
 def _exponential(power: Fraction, precision: int) -> tuple[int, int]:
-    """One of `exponentials`. `decimal` rounds each operation correctly: with these digits the product errs by less than 1."""
+    """Return integers below and above 2^precision · e^power. `decimal` rounds correctly, so the product errs by less than 1."""
     if power == 0:
         return 1 << precision, 1 << precision
     if -power > precision:
@@ -110,7 +111,7 @@ def _exponential(power: Fraction, precision: int) -> tuple[int, int]:
 
 
 def chances(counts: NDArray[np.integer], powers: Sequence[float]) -> NDArray[np.float64]:
-    """The chances to a double's precision. (..., J), J -> (..., J)"""
+    """Return the chances to the precision of a double. (..., J), J -> (..., J)"""
     with np.errstate(divide="ignore"):
         logs = np.log(counts) + np.array(powers, dtype=float)
     return np.exp(logs - np.logaddexp.reduce(logs, axis=-1, keepdims=True))

@@ -1,8 +1,9 @@
 """Exact draws of words with weights by similarity to the true word, in a few levels.
 
-The words of a level are equally likely. A draw is one of a level, with chances that `bench.mechanisms.classes` compares bit by
-bit, and then one of an integer. Floating-point noise (Gumbel's, say) added to the utilities has neither the chances of the
-theorem nor the same set of values for each input. The low bits of such sums reveal the input (Mironov, CCS 2012).
+The words of a level are equally likely. A draw consists of two: first a level, with chances that `bench.mechanisms.classes`
+compares bit by bit, then an integer. The alternative, floating-point noise (such as Gumbel's) added to the utilities, does not
+have the chances of the theorem. Its set of values differs between inputs, so the low bits of the sums reveal the input (Mironov,
+CCS 2012).
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from bench.types import Indices
 def draw_graded_words(
     neighbours: Neighbours, true: Indices, borders: Doubles, powers: Sequence[Fraction], size: int, rng: np.random.Generator
 ) -> Indices:
-    """Draw words one at a time without replacement, with chances in proportion to e^power.
+    """Return words drawn one at a time without replacement, with chances in proportion to e^power.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Inference from several independent releases of the same features: common points of subspaces and recurring words."""
+"""Inference from several independent releases of the same features: common points of subspaces, and recurring words."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ NEGLIGIBLE = 1e-18  # states of a lower chance are skipped by `compute_success_c
 
 
 def find_common_points(releases: Sequence[Subspaces]) -> Doubles:
-    """Return for each keypoint the point of its first subspace nearest to its other ones, in least squares.
+    """Return for each keypoint the point of its first subspace nearest to its other subspaces, in least squares.
 
-    With p the point of the first subspace nearest to zero and B its basis, c minimises Σ_t |(I − B_tᵀ B_t)(p + Bᵀ c − o_t)|²,
-    which is a system of dim equations. Where subspaces share a direction, as two liftings with the same word do, the
-    minimisers form a line or more, and the one nearest to zero is returned; with one release that is p. So the result depends
-    on the subspaces alone, not on their bases and origins.
+    Let p be the point of the first subspace nearest to zero and B its basis. The result is p + Bᵀ c, where c minimises
+    Σ_t |(I − B_tᵀ B_t)(p + Bᵀ c − o_t)|²: a system of dim equations. If subspaces have a common direction, as two liftings with
+    the same word do, the minimisers form a line or more. Then the one nearest to zero is returned; with one release that is p. So
+    the result depends on the subspaces alone, not on their bases and origins.
 
     Parameters
     ----------
-    releases : T subspaces of each of N keypoints, in one order
+    releases : T releases of the same N keypoints, in the same order
 
     Returns
     -------
@@ -61,9 +61,9 @@ def _project_onto_span(bases: Doubles, vectors: Doubles) -> Doubles:
 
 
 def select_likeliest(words: Indices, rng: np.random.Generator) -> Indices:
-    """Return the column of a word of greatest likelihood given T sets of the ω-subset mechanism.
+    """Return the column of the word of greatest likelihood given T sets of the ω-subset mechanism.
 
-    Pr(Z_1, ..., Z_T | v) is proportional to exp(ε |{t : v in Z_t}|), so it is the word in most of the sets. Ties are
+    Pr(Z_1, ..., Z_T | v) is proportional to exp(ε |{t : v in Z_t}|), so this is the word in most of the sets. Ties are
     broken at random.
 
     Parameters
@@ -78,15 +78,15 @@ def select_likeliest(words: Indices, rng: np.random.Generator) -> Indices:
     count = np.zeros(words.shape)
     for column in range(columns):
         count += words == words[:, column, None]
-    # A word in c sets has c columns, and so have the words that it ties with: each is equally likely to be drawn.
+    # A word in c sets has c columns, as have the words that it ties with, so all of them are equally likely.
     return (count + rng.random(words.shape)).argmax(axis=1)
 
 
 def compute_success_chances(epsilon: float, domain: int, size: int, releases: int) -> list[float]:
-    """Compute the chance that `select_likeliest` picks the true word of T = 1, ..., `releases` sets, by enumeration.
+    """Return the chance that `select_likeliest` picks the true word of T = 1, ..., `releases` sets, by enumeration.
 
-    A state is the number of sets with the true word, and the number of the |K| − 1 wrong words in 1, 2, ... sets. A further set
-    adds a hypergeometric draw. States of a chance below 1e-18 are skipped.
+    A state consists of the number of sets with the true word, and the numbers of wrong words (of |K| − 1) in 1, 2, ... sets. A
+    further set adds a hypergeometric draw. States with a chance below 1e-18 are skipped.
 
     Parameters
     ----------
@@ -111,7 +111,7 @@ def compute_success_chances(epsilon: float, domain: int, size: int, releases: in
 
 
 def _compute_pick_chance(true: int, wrong: tuple[int, ...]) -> float:
-    """The chance that the true word, in `true` sets, is drawn among the words in most sets; wrong[c - 1] others are in c."""
+    """Return the chance to pick the true word, in `true` sets, among the words in most sets; wrong[c - 1] others are in c."""
     if true == 0 or any(wrong[true:]):
         return 0.0
     return 1 / (1 + wrong[true - 1])
@@ -137,9 +137,9 @@ def _enumerate_splits(classes: tuple[int, ...], size: int) -> Iterator[tuple[int
 
 
 def bound_success(epsilon: float, domain: int) -> float:
-    """Return the upper bound of any guess's chance at a secret that is uniform on `domain` values, given an ε-LDP release.
+    """Return an upper bound of the success of any guess of a secret, uniform on `domain` values, from an ε-LDP release.
 
-    For a guess g, Σ_v Pr(z | v) ≥ Pr(z | g(z)) (1 + (|K| − 1) e^-ε) at each output z. Summed over z, the left side is
-    |K|, and the chance of success is Σ_z Pr(z | g(z)) / |K| ≤ 1 / (1 + (|K| − 1) e^-ε). T releases compose to T ε.
+    A guess g has Σ_v Pr(z | v) ≥ Pr(z | g(z)) (1 + (|K| − 1) e^-ε) at each output z. Summed over z, the left side is |K|. So the
+    chance of success is Σ_z Pr(z | g(z)) / |K| ≤ 1 / (1 + (|K| − 1) e^-ε). T releases compose to T ε.
     """
     return 1 / (1 + (domain - 1) * math.exp(-epsilon))

@@ -1,4 +1,4 @@
-"""Protection for deployment: the randomness comes from the operating system and cannot be reproduced."""
+"""Protection for deployment, with randomness from the operating system, which cannot be reproduced."""
 
 from __future__ import annotations
 
@@ -22,39 +22,39 @@ KEY_BYTES = 32  # bytes
 
 
 def protect(features: Features, defense: Defense, public: Public | None = None, *, device: Path | str | None = None) -> Release:
-    """Return the release, which may leave the phone.
+    """Return the release of features for deployment. It may leave the phone; the features must not.
 
     Parameters
     ----------
     features : the secret
     defense : such as `LDP(epsilon=10)`
-    public : pass one `Public()` to all calls, so that the dictionary is read once
-    device : file of the device's secret key, for memoized defenses only; created if missing
+    public : dictionaries; pass one `Public()` to all calls, so that each dictionary is read once
+    device : file of the device's secret key, for memoized defenses only; it is created if missing
 
     Raises
     ------
     UserError
-        if the dictionary is missing, damaged or does not fit the features, or the key is missing or damaged.
+        if the dictionary is missing or damaged, or does not suit the features; or if the key is missing or damaged.
     """
     public = public or Public()
     if defense.is_memoized() and device is None:
-        raise UserError(f"{defense.name()}, as configured, needs the file of the device's key: protect(..., device=PATH)")
+        raise UserError(f"{defense.name()}, as configured, needs a file for the device's key: protect(..., device=PATH)")
     if device is not None and not defense.is_memoized():
-        raise UserError(f"{defense.name()}, as configured, is not memoized: a key would repeat the draws")
+        raise UserError(f"{defense.name()}, as configured, is not memoized; omit device=, because a key would repeat the draws")
     key = secrets.token_bytes(KEY_BYTES) if device is None else _derive_key(_load_device_key(Path(device)), defense, public)
     return defense.protect(features, public, create_generator(key))
 
 
 def create_generator(key: bytes) -> np.random.Generator:
-    """Return a generator of the bits of the ChaCha20 cipher under a 256-bit key (Bernstein 2008; RFC 8439).
+    """Return a generator whose bits are those of the ChaCha20 cipher with a 256-bit key (Bernstein 2008; RFC 8439).
 
-    NumPy's own generators are not cryptographic: a few outputs of PCG64 reveal its state, and so all draws.
+    NumPy's own generators are not cryptographic: a few outputs of PCG64 reveal its state, and with it all draws.
     """
     return np.random.Generator(ChaCha(key=int.from_bytes(key, "little"), rounds=20))
 
 
 def _derive_key(key: bytes, defense: Defense, public: Public) -> bytes:
-    """Return a key for this configuration: under one key, the answers of two configurations would be dependent."""
+    """Return a key for this configuration. With one key, the answers of two configurations would be dependent."""
     return hashlib.blake2b(
         canonical_json(spec.to_json_with_digests(defense, public)).encode(), key=key, digest_size=KEY_BYTES
     ).digest()
@@ -68,7 +68,7 @@ def _load_device_key(path: Path) -> bytes:
     except OSError as error:
         raise UserError(f"{path}: cannot create or read the device's key: {error.strerror}") from error
     if len(key) != KEY_BYTES:
-        raise UserError(f"{path}: a device's key has {KEY_BYTES} bytes, this file {len(key)}")
+        raise UserError(f"{path}: a device's key has {KEY_BYTES} bytes, but this file has {len(key)}")
     return key
 
 

@@ -1,16 +1,16 @@
-"""The ω-subset mechanism, sampled exactly: no step is rounded, so released sets have exactly the theorem's distribution.
+"""The ω-subset mechanism, sampled exactly: no step is rounded, so released sets have exactly the distribution of the theorem.
 
 Theorem. Let K be a finite set, v in K, 1 ≤ m ≤ |K| and ε ≥ 0. Draw u = 1 with probability
 
     p = m e^ε / (m e^ε + |K| − m)                                                                        Eq. (5)
 
-draw m − u elements without replacement from K − {v}, and add v if u = 1. The set Z that results has
+draw m − u elements without replacement from K − {v}, and add v if u = 1. The resulting set Z has
 
     Pr(Z | v) = |K| e^ε / (m e^ε + |K| − m) / C(|K|, m)   if v is in Z,
     Pr(Z | v) = |K|     / (m e^ε + |K| − m) / C(|K|, m)   if it is not,
 
-which sums to 1 over all Z, and Pr(Z | v1) ≤ e^ε Pr(Z | v2) for all Z, v1, v2: the mechanism is ε-LDP. (The paper's Definition 2
-prints m in place of the first |K|, and then sums to m / |K|; its Eq. (5) and the ratio are right.)
+which sums to 1 over all Z. Pr(Z | v1) ≤ e^ε Pr(Z | v2) for all Z, v1, v2, so the mechanism is ε-LDP. The paper's Definition 2 has
+m in place of the first |K|, and then sums to m / |K|. Its Eq. (5) and the ratio are right.
 
 A set has no order, so rows are sorted. ε is the decimal or fraction as written (`bench.core.exact`): 0.1 is one tenth.
 """
@@ -30,14 +30,14 @@ from bench.core.exact import to_fraction
 from bench.types import Bytes, Indices
 
 WIDTH = 64  # bits of p compared in one step
-STEP = 2**15  # words drawn at a time: they stay in the cache
+STEP = 2**15  # words drawn at a time, which fit into the cache
 
 
 def chance_digits(epsilon: float, domain: int, size: int, bits: int) -> int:
-    """The first `bits` binary digits of p: floor(2^bits · p), exactly.
+    """Return the first `bits` binary digits of p: floor(2^bits · p), exactly.
 
-    p is 1 for ε = ∞ and for |K| = m. For any other ε but 0, e^ε is transcendental (Lindemann), so p lies on no multiple
-    of 2^-bits, and a finite precision determines its side.
+    p is 1 for ε = ∞ and for |K| = m. For any other ε except 0, e^ε is transcendental (Lindemann). So p is no multiple of 2^-bits,
+    and a finite precision determines the digits.
     """
     return 1 << bits if _is_certain(epsilon, domain, size) else _compute_digits(to_fraction(epsilon), domain, size, bits)
 
@@ -63,7 +63,7 @@ def _is_certain(epsilon: float, domain: int, size: int) -> bool:
 
 
 def _enclose_chance(power: Fraction, rest: int, size: int, precision: int) -> tuple[Fraction, Fraction]:
-    """Bounds of p from `precision` decimal digits: from ε rounded down, and from ε rounded up."""
+    """Return bounds of p, computed with `precision` decimal digits from ε rounded down and from ε rounded up."""
     low, high = (
         Context(prec=precision, rounding=rounding, Emax=MAX_EMAX, Emin=MIN_EMIN).divide(
             Decimal(power.numerator), Decimal(power.denominator)
@@ -74,10 +74,10 @@ def _enclose_chance(power: Fraction, rest: int, size: int, precision: int) -> tu
 
 
 def _bound_chance(power: Decimal, rest: int, size: int, precision: int) -> tuple[Fraction, Fraction]:
-    """Bounds of p at a decimal ε.
+    """Return bounds of p at a decimal ε.
 
-    Each operation of `decimal`, exp among them, is correctly rounded, and so errs by a factor within 1 ± 5 · 10^-precision.
-    The numerator has two such factors, the denominator three and the quotient one: below 1 ± 4 · 10^(1 - precision).
+    Each operation of `decimal`, including exp, is correctly rounded, so it errs by a factor within 1 ± 5 · 10^-precision. The
+    numerator has two such factors, the denominator three and the quotient one: together within 1 ± 4 · 10^(1 - precision).
     """
     context = Context(prec=precision, rounding=ROUND_HALF_EVEN, Emax=MAX_EMAX, Emin=MIN_EMIN)
     weight = context.multiply(Decimal(size), context.exp(power))
@@ -87,7 +87,7 @@ def _bound_chance(power: Decimal, rest: int, size: int, precision: int) -> tuple
 
 
 def log10_chance(epsilon: float, domain: int, size: int) -> float:
-    """log10 p to a double's precision, for domains of any size."""
+    """Return log10 p to the precision of a double, for domains of any size."""
     if _is_certain(epsilon, domain, size):
         return 0.0
     odds_against = math.log(domain - size) - math.log(size) - epsilon  # ln((1 − p) / p); math.log takes integers of any size
@@ -95,7 +95,7 @@ def log10_chance(epsilon: float, domain: int, size: int) -> float:
 
 
 def mutual_information(epsilon: float, domain: int, sizes: Indices) -> NDArray[np.float64]:
-    """Mutual information in nats of a released set and a uniform true word, for each size m. (S,) -> (S,)
+    """Return the mutual information, in nats, of a released set and a uniform true word, for each size m. (S,) -> (S,)
 
     I = p ε + ln(|K| / (m e^ε + |K| − m)), as a set contains the true word with probability p and all sets are equally likely.
     """
@@ -106,16 +106,16 @@ def mutual_information(epsilon: float, domain: int, sizes: Indices) -> NDArray[n
 
 
 def most_informative_size(epsilon: float, domain: int) -> int:
-    """Return the size m < |K| of greatest mutual information with the true word.
+    """Return the size m < |K| with the greatest mutual information of a set and the true word.
 
-    It is about |K| (ε e^ε − e^ε + 1) / (e^ε − 1)², where I has no slope (Wang et al., arXiv:1607.08025).
+    It is about |K| (ε e^ε − e^ε + 1) / (e^ε − 1)², where the derivative of I is zero (Wang et al., arXiv:1607.08025).
     """
     sizes = np.arange(1, domain)
     return 1 if math.isinf(epsilon) else int(sizes[mutual_information(epsilon, domain, sizes).argmax()])
 
 
 def most_accurate_size(epsilon: float, domain: int) -> int:
-    """Return the size at which sets of many people estimate word frequencies best.
+    """Return the size for which sets of many users give the best estimate of word frequencies.
 
     It is |K| / (e^ε + 1) (Ye and Barg, arXiv:1702.00610). A set then contains the true word with a chance of about one half. Both
     sizes tend to |K| / 2 for small ε and differ for large ε.
@@ -125,9 +125,10 @@ def most_accurate_size(epsilon: float, domain: int) -> int:
 
 
 def draw_inclusion(rows: int, epsilon: float, domain: int, size: int, rng: np.random.Generator) -> NDArray[np.bool_]:
-    """Draw u, whether a row's set contains the true word: a uniform number below p, both read bit by bit. -> (N,)
+    """Return random u, whether the set of a row contains the true word: whether a uniform number is below p. -> (N,)
 
-    Two numbers compare as their first 64 bits do, unless these are equal (chance 2^-64): then as the next 64, and so on.
+    The number and p are compared bit by bit. The first 64 bits decide, unless they are equal (chance 2^-64). Then the next 64
+    bits decide, and so on.
     """
     if _is_certain(epsilon, domain, size):
         return np.ones(rows, dtype=bool)
@@ -144,10 +145,10 @@ def draw_inclusion(rows: int, epsilon: float, domain: int, size: int, rng: np.ra
 
 
 def draw_distinct(rows: int, domain: int, size: int, rng: np.random.Generator) -> Indices:
-    """Draw for each row `size` distinct numbers below `domain`, every subset equally likely. -> (N, size), unordered
+    """Return for each row `size` random distinct numbers below `domain`, with all subsets equally likely. -> (N, size), unordered
 
-    Floyd's algorithm (Bentley and Floyd, CACM 1987): whatever the domain, one draw an element and no rejection.
-    The order of a row is not uniform; sort it before a release.
+    Floyd's algorithm (Bentley and Floyd, CACM 1987) takes one draw per element without rejection, for any domain. The order of a
+    row is not uniform; sort it before a release.
     """
     if size > domain:
         raise ValueError(f"cannot draw {size} distinct numbers from {domain}")
@@ -161,11 +162,11 @@ def draw_distinct(rows: int, domain: int, size: int, rng: np.random.Generator) -
 
 
 def draw_word_subsets(true: Indices, domain: int, epsilon: float, size: int, rng: np.random.Generator) -> Indices:
-    """The ω-subset mechanism on K = {0, ..., domain − 1}. true: (N,) -> (N, m), rows ascending
+    """Return random sets of the ω-subset mechanism on K = {0, ..., domain − 1}. true: (N,) -> (N, m), rows ascending
 
-    Where repetitions are rare, words are drawn independently. Only sets with a repetition are drawn again, without replacement.
-    All sets of distinct words are equally likely to pass, so both kinds have the law of the theorem. The cost does not depend on
-    |K|.
+    If repetitions are rare, words are drawn independently. Only sets with a repetition are drawn again, without replacement. All
+    sets of distinct words are equally likely to be accepted, so both kinds have the distribution of the theorem. The cost does
+    not depend on |K|.
     """
     included = draw_inclusion(len(true), epsilon, domain, size, rng)
     if size * size > domain or domain == 1:
@@ -177,7 +178,7 @@ def draw_word_subsets(true: Indices, domain: int, epsilon: float, size: int, rng
 
 
 def _draw_one_by_one(true: Indices, included: NDArray[np.bool_], domain: int, size: int, rng: np.random.Generator) -> Indices:
-    """Draw words other than v independently; v replaces the first where u = 1. (N,), (N,) -> (N, m), rows ascending"""
+    """Return words other than v, drawn independently; v replaces the first if u = 1. (N,), (N,) -> (N, m), rows ascending"""
     words = np.empty((len(true), size), dtype=np.int64)
     step = max(1, STEP // size)
     for start in range(0, len(true), step):
@@ -190,7 +191,7 @@ def _draw_one_by_one(true: Indices, included: NDArray[np.bool_], domain: int, si
 
 
 def _sort_rows(columns: Indices) -> Indices:
-    """Sort the rows of a matrix given by its columns. (m, n) -> (n, m)"""
+    """Return the sorted rows of a matrix that is given by its columns. (m, n) -> (n, m)"""
     if len(columns) > 4:
         rows = columns.T.copy()
         rows.sort(axis=1)
@@ -203,16 +204,16 @@ def _sort_rows(columns: Indices) -> Indices:
 
 
 def _find_repeating(rows: Indices) -> Indices:
-    """Return the indices of the ascending rows with a repeated word. (n, m) -> (r,)"""
+    """Return the indices of rows with a repeated word; rows must be ascending. (n, m) -> (r,)"""
     flat, length = rows.ravel(), rows.shape[1]
     equal = np.flatnonzero(flat[1:] == flat[:-1])
-    return np.unique(equal[equal % length < length - 1] // length)  # not across the end of a row
+    return np.unique(equal[equal % length < length - 1] // length)  # a pair across the end of a row does not count
 
 
 def _draw_without_repetition(
     true: Indices, included: NDArray[np.bool_], domain: int, size: int, rng: np.random.Generator
 ) -> Indices:
-    """Draw the sets of the mechanism given u, for any m up to |K|. (N,), (N,) -> (N, m), rows ascending"""
+    """Return random sets of the mechanism given u, for any m up to |K|. (N,), (N,) -> (N, m), rows ascending"""
     words = np.empty((len(true), size), dtype=np.int64)
     for u in (0, 1):
         rows = np.flatnonzero(included == u)
@@ -225,7 +226,10 @@ def _draw_without_repetition(
 
 
 def draw_pattern_subsets(true: Bytes, epsilon: float, size: int, rng: np.random.Generator) -> Bytes:
-    """The ω-subset mechanism on all 256^B patterns of B bytes, for m < 256^B. true: (N, B) -> (N, m, B), rows in byte order"""
+    """Return random sets of the ω-subset mechanism on all 256^B patterns of B bytes, for m < 256^B.
+
+    true: (N, B) -> (N, m, B), rows in byte order
+    """
     rows, length = true.shape
     included = draw_inclusion(rows, epsilon, 256**length, size, rng)
     patterns = np.empty((rows, size, length), dtype=np.uint8)
@@ -233,7 +237,7 @@ def draw_pattern_subsets(true: Bytes, epsilon: float, size: int, rng: np.random.
     while len(waiting):
         others = rng.integers(256, size=(len(waiting), size, length), dtype=np.uint8)
         patterns[waiting] = others
-        # m others, distinct from each other and from the true one, which replaces one of them where it is included.
+        # m other patterns, all distinct and different from the true one, which replaces one of them if it is included.
         whole = _sort_patterns(np.concatenate([others, true[waiting, None]], axis=1))  # (waiting, m + 1, B)
         waiting = waiting[(whole[:, 1:] == whole[:, :-1]).all(axis=2).any(axis=1)]
     patterns[included, 0] = true[included]
@@ -241,6 +245,6 @@ def draw_pattern_subsets(true: Bytes, epsilon: float, size: int, rng: np.random.
 
 
 def _sort_patterns(patterns: Bytes) -> Bytes:
-    """Sort each row's patterns as strings of bytes. (N, m, B) -> (N, m, B)"""
+    """Return the patterns of each row sorted as strings of bytes. (N, m, B) -> (N, m, B)"""
     opaque = np.ascontiguousarray(patterns).view(np.dtype((np.void, patterns.shape[2])))[..., 0]  # (N, m), compared by memcmp
     return np.sort(opaque, axis=1)[..., None].view(np.uint8)

@@ -1,17 +1,18 @@
 """Choice of the subset size for a dictionary and an ε, by two criteria.
 
 1. *Information*: the size of greatest mutual information of a set and its word (`bench.mechanisms.subset.mutual_information`).
-2. *Localization*: the size at which RANSAC most likely finds the pose within its trials. The model:
+2. *Localization*: the size for which RANSAC most likely finds the pose within its trials. The model:
 
    Of N keypoints, n have the same word as their point in one of the retrieved references. Each such word is released with the
-   probability p of Eq. (5), so I ~ Binomial(n, p) matches are right. Each of the N m released words is also the word of R / |K|
-   other points, where R points are in the references. So W = N m R / |K| matches are wrong. For T samples of s = 3 matches
+   probability p of Eq. (5), so I ~ Binomial(n, p) matches are right. The references have R points. Each of the N m released words
+   is also the word of R / |K| other points, so W = N m R / |K| matches are wrong. RANSAC draws T samples of s = 3 matches. The
+   chance that one sample has only right matches, and yields the pose, is
 
        1 − (1 − C(I, s) / C(I + W, s))^T
 
-   is the chance that one sample has only right matches and yields the pose. A wrong pose has as inliers its own sample and
-   Poisson(a W) other matches; a is the chance that a random point of the image is within RANSAC's threshold. The pose is selected
-   if it has more inliers than each of T wrong poses: with probability F(I − s − 1)^T, F being Poisson's distribution function.
+   The inliers of a wrong pose are its own sample and Poisson(a W) other matches. Here a is the chance that a random point of the
+   image is within RANSAC's threshold. The pose is selected if it has more inliers than each of T wrong poses. The probability is
+   F(I − s − 1)^T, where F is Poisson's distribution function.
 
    p / m falls with m, so the fraction of right matches is greatest for m = 1, but the number of right matches may be too small.
 """
@@ -34,9 +35,9 @@ from bench.types import Indices
 
 Doubles = NDArray[np.float64]
 
-SAMPLE = 3  # matches that P3P takes
+SAMPLE = 3  # matches per sample of P3P
 RECALL = "recall_0.25m_2deg"
-EPSILON_TOLERANCE = 5e-4  # greatest difference of values of ε that agree to three digits
+EPSILON_TOLERANCE = 5e-4  # values of ε with a smaller difference, which agree to three digits, count as equal
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,8 +45,8 @@ class Workload:
     """Parameters of the localization model. The defaults are medians over the gallery's queries by day."""
 
     keypoints: int = 1000  # N, of a query
-    repeatability: Sequence[float] = (0.27,)  # n / N, of one query, or of several to average over
-    points: int = 5000  # R, of the retrieved references
+    repeatability: Sequence[float] = (0.27,)  # n / N of one query, or of several, over which success is averaged
+    points: int = 5000  # R, in the retrieved references
     trials: int = 30_000  # T
     agreement: float = math.pi * 12**2 / (640 * 480)  # a: 12 pixels, in an image of that size
 
@@ -56,14 +57,14 @@ class SizeEstimate:
 
     size: int  # m
     inclusion: float  # p
-    bits: float  # of information in a set about its word
-    right: float  # matches of a query that are right, on average
+    bits: float  # information of a set about its word
+    right: float  # expected number of right matches of a query
     wrong: float
-    success: float  # the chance that RANSAC finds the pose
+    success: float  # chance that RANSAC finds the pose
 
 
 def estimate_sizes(epsilon: float, domain: int, sizes: Sequence[int], workload: Workload) -> list[SizeEstimate]:
-    """Predict information and localization for each size.
+    """Return predictions of information and localization for each size.
 
     Raises
     ------
@@ -73,13 +74,13 @@ def estimate_sizes(epsilon: float, domain: int, sizes: Sequence[int], workload: 
     if not epsilon >= 0 or math.isinf(epsilon):
         raise UserError(f"--epsilon: must be at least 0 and finite, got {epsilon}")
     if domain < 2:
-        raise UserError(f"--words: a dictionary has at least 2 words, not {domain}")
+        raise UserError(f"--words: must be at least 2, got {domain}")
     if not sizes or not all(0 < size < domain for size in sizes):
-        raise UserError(f"--sizes: a set has at least 1 word and fewer than the dictionary's {domain}, got {list(sizes)}")
+        raise UserError(f"--sizes: must be at least 1 and less than the dictionary's {domain} words, got {list(sizes)}")
     if workload.keypoints < 1 or workload.points < 0 or workload.trials < 1:
-        raise UserError("a query has at least 1 keypoint, references show no negative number of points, RANSAC makes a trial")
+        raise UserError("--keypoints and --trials must be at least 1, and --points at least 0")
     if not all(0 <= fraction <= 1 for fraction in (*workload.repeatability, workload.agreement)):
-        raise UserError("repeatability and agreement must be from 0 to 1")
+        raise UserError("--repeated (repeatability) and agreement must be from 0 to 1")
     bits = mutual_information(epsilon, domain, np.array(sizes)) / math.log(2)
     return [
         _estimate_size(epsilon, domain, size, float(information), workload) for size, information in zip(sizes, bits, strict=True)
@@ -113,21 +114,21 @@ def compute_sample_chance(right: Indices, wrong: float, trials: int) -> Doubles:
 
 
 def compute_selection_chance(right: Indices, wrong: float, trials: int, agreement: float) -> Doubles:
-    """Return the chance that the pose has more inliers than any wrong pose. (I,) -> (I,)"""
+    """Return the chance that the pose has more inliers than every wrong pose. (I,) -> (I,)"""
     return np.exp(trials * stats.poisson.logcdf(right - SAMPLE - 1, wrong * agreement))
 
 
 def collect_recalls(
     records: Sequence[Mapping[str, Any]], epsilon: float, domain: int, trials: int, condition: str
 ) -> tuple[dict[int, list[float]], list[float]]:
-    """Collect localization results with `ldp`: per size, whether each query was localized; and n / N of each query.
+    """Return localization results with `ldp`: size -> whether each query was localized, and n / N of each query.
 
-    n / N is the fraction of a query's matches that are right without a guarantee: with ε = ∞, m = 1 and the same dictionary.
+    n / N is measured without a guarantee, with ε = ∞, m = 1 and the same dictionary: the number of inliers per keypoint.
 
     Raises
     ------
     UserError
-        if there is neither.
+        if there are no such results.
     """
     recalls: dict[int, list[float]] = {}
     repeatability = []
@@ -146,7 +147,7 @@ def collect_recalls(
 
 
 def _is_comparable(record: Mapping[str, Any], trials: int, condition: str) -> bool:
-    """Whether the record is of a query under that condition, with the default matcher and so many trials."""
+    """Return whether a record is of a query under that condition, with default matcher and retrieval and that many trials."""
     settings = record.get("task_settings") or {}
     return (
         record["task"] == "localization"

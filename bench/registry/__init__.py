@@ -1,1 +1,1 @@
-"""Plugins: discovery, specs as text, fields, and templates for new plugins."""
+"""Registry of plugins: discovery, specifications as text, fields, and templates for new plugins."""

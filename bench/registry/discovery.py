@@ -1,4 +1,4 @@
-"""Finds plugins by file name and by entry point, and checks them. Errors state the correct form.
+"""Discovery of plugins by file name and by entry point, and checks of their form.
 
 A plugin is imported only when it is loaded, so `bench --help` imports no heavy library.
 """
@@ -103,7 +103,7 @@ def check(kind: Kind[P], plugin: Any) -> type[P]:
     Raises
     ------
     UserError
-        that says what is wrong and what is right.
+        with the fault and the correct form.
     """
     for fault in _find_faults(kind, plugin):
         raise UserError(f"{kind.name} plugin {_format_name(plugin)}: {fault}")
@@ -160,7 +160,7 @@ def _format_name(plugin: Any) -> str:
 
 
 def _find_faults(kind: Kind[P], plugin: Any) -> list[str]:
-    """Return what is wrong with a plugin. Later checks rely on earlier ones."""
+    """Return the faults of a plugin, from the first check that finds any. Later checks rely on earlier ones."""
     if not isinstance(plugin, type) or not issubclass(plugin, kind.bases):
         return [f"must be a subclass of {' or '.join(base.__name__ for base in kind.bases)}"]
     return _check_class(plugin) or _check_fields(plugin) or _check_methods(plugin) or _check_declarations(plugin)

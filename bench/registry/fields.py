@@ -52,7 +52,7 @@ def parse_value(kind: Any, text: str) -> Any:
     Raises
     ------
     ValueError
-        if the text is not as `describe_type(kind)` says.
+        if the text is no value of the type (see `describe_type`).
     """
     if get_origin(kind) is Literal:
         return _parse_choice(get_args(kind), text)

@@ -1,4 +1,4 @@
-"""Writes a small package with a new plugin and a test of its contract."""
+"""Generation of a small package with a new plugin and a test of its contract."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def write(kind: str, name: str, out: Path) -> list[Path]:
         raise unknown_name("kind of plugin", kind, KINDS)
     module = name.replace("-", "_")
     if not NAME.fullmatch(name) or keyword.iskeyword(module):
-        raise UserError(f"{name!r} is not a valid plugin name: use small letters, digits, and - between words")
+        raise UserError(f"{name!r} is not a valid plugin name: use lower-case letters, digits, and - between words")
     existing = discovery.discover(KINDS[kind])
     if name in existing:
         raise UserError(f"a {kind} named {name!r} exists already: {existing[name].origin}")

@@ -1,4 +1,4 @@
-"""Plugins as text, `name:field=value,field=value`, and as the JSON of records."""
+"""Conversion of plugins from text, `name:field=value,field=value`, and to the JSON of records."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ P = TypeVar("P", bound=Plugin)
 
 
 def parse(text: str, kind: Kind[P]) -> tuple[type[P], dict[str, Any]]:
-    """Parse `name:field=value,...` into the plugin and the given fields.
+    """Parse `name:field=value,...`, and return the plugin and the given fields.
 
     Raises
     ------
@@ -45,7 +45,7 @@ def parse(text: str, kind: Kind[P]) -> tuple[type[P], dict[str, Any]]:
 
 
 def build(plugin: type[P], given: Mapping[str, Any]) -> P:
-    """Build the plugin. Fields that are not given have their defaults.
+    """Return the plugin with the given fields. Other fields have their defaults.
 
     Raises
     ------
@@ -61,14 +61,14 @@ def build(plugin: type[P], given: Mapping[str, Any]) -> P:
 
 
 def read(text: str, kind: Kind[P]) -> P:
-    """`parse`, then `build`."""
+    """Return the plugin that a text specifies: `parse`, then `build`."""
     return build(*parse(text, kind))
 
 
 def to_json_with_digests(plugin: Plugin, public: Public, resolved: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """Return name and fields of a plugin as JSON, with each file replaced by the digest of its content.
 
-    The values of `resolved` override fields. Other assets are dictionaries.
+    The values of `resolved` override fields. All other assets must be dictionaries.
 
     Raises
     ------

@@ -1,1 +1,1 @@
-"""Runs experiments: plan, trial, execute, engines, the attack process, the run directory, records."""
+"""Execution of experiments: plans, trials, engines, the attack process, the run directory, records."""

@@ -1,11 +1,11 @@
-"""Executes an attack in a process that never holds the secret.
+"""Execution of an attack in a process that never holds the secret.
 
-The process starts afresh. It receives the attack, and what `bench run` would show it: the release, configurations, and the
-knowledge that it declared to need, on request. The photograph and the true descriptors stay with the process that scores. The
-answer is JSON and arrays, never pickled objects, so that no code of the attack runs where the secret is.
+The attack process is spawned, not forked. It receives the attack and its `View`: the release and the configurations, and on
+request the knowledge in `needs`. The photograph and the true descriptors stay in the scoring process. The answer consists of
+JSON and arrays. It contains no pickled objects, so the scoring process executes no code from it.
 
-The two processes share no memory. This is no security sandbox: the attack process may read every file that its user may read, and
-both processes import the plugin's module.
+The two processes share no memory. This is no security sandbox. The attack process can read every file that its user can read,
+and both processes import the plugin's module.
 """
 
 from __future__ import annotations
@@ -34,16 +34,18 @@ Method = Callable[[View, np.random.Generator], Any]
 
 
 def execute_in_attack_process(method: Method, view: View, rng: np.random.Generator) -> Any:
-    """Return what `method(view, rng)` returns; `rng` and the view's notes change as the method changes them. An `Execute`.
+    """Return the result of `method(view, rng)`, executed in a new process (an `Execute`).
+
+    `rng` and the notes of the view change as the method changes them.
 
     Raises
     ------
     SampleError
-        if the attack raises that, or its process ends.
+        if the attack raises it, or the attack process ends early.
     RuntimeError
-        if the attack raises something else; the message has its traceback.
+        if the attack raises another error; the message contains its traceback.
     """
-    context = multiprocessing.get_context("spawn")  # a fork would have all of this process's memory
+    context = multiprocessing.get_context("spawn")  # a fork would copy the memory of this process
     ours, theirs = context.Pipe()
     process = context.Process(target=_execute, args=(theirs,), daemon=True)
     process.start()
@@ -54,7 +56,7 @@ def execute_in_attack_process(method: Method, view: View, rng: np.random.Generat
         return _serve(ours, view, rng)
     except (EOFError, ConnectionError):
         process.join()
-        raise SampleError(f"the process of the attack ended with status {process.exitcode}") from None
+        raise SampleError(f"the attack process ended with status {process.exitcode}") from None
     finally:
         ours.close()
         process.join(1)
@@ -62,7 +64,7 @@ def execute_in_attack_process(method: Method, view: View, rng: np.random.Generat
 
 
 def _serve(ours: Connection, view: View, rng: np.random.Generator) -> Any:
-    """Answer the attack process's requests until it is done."""
+    """Answer the requests of the attack process, and return its result."""
     while True:
         message = json.loads(ours.recv_bytes())
         if message["kind"] == "request":
@@ -79,7 +81,7 @@ def _serve(ours: Connection, view: View, rng: np.random.Generator) -> Any:
 
 
 def _pack(view: View, kind: type[Knowledge], count: int) -> Any:
-    """Return the part of the knowledge that can be sent: no cache, for it may have seen where the secret quantises to."""
+    """Return knowledge in a form that can be sent, without caches: they can hold the nearest words of the secret."""
     knowledge = view.know(kind)
     if isinstance(knowledge, OtherReleases):
         return list(knowledge.draw(count))
@@ -91,7 +93,7 @@ def _pack(view: View, kind: type[Knowledge], count: int) -> Any:
 
 
 def _unpack(theirs: Connection, kind: type[Knowledge]) -> Knowledge:
-    """Return knowledge as a `View` gives it."""
+    """Return knowledge as `View.know` returns it."""
     if kind is OtherReleases:
         return OtherReleases(draw=functools.partial(_other_releases, theirs))
     packed = _request(theirs, kind, 0)
@@ -107,13 +109,13 @@ def _unpack(theirs: Connection, kind: type[Knowledge]) -> Knowledge:
 
 
 def _scene_of(public: Public) -> tuple[Scene, Extractor] | None:
-    """Return the scene that is served, without its queries, one of which is the secret."""
+    """Return the server's scene and extractor; None without a scene. The index has no queries, one of which is the secret."""
     index = public.scene_index
     return None if index is None else (index.scene, index.extractor)
 
 
 def _public(served: tuple[Scene, Extractor] | None) -> Public:
-    """Return what everyone can read."""
+    """Return the public assets, with the index of the server's scene."""
     return Public(scene_index=None if served is None else SceneIndex(*served))
 
 
@@ -127,7 +129,7 @@ def _request(theirs: Connection, kind: type[Knowledge], count: int) -> Any:
 
 
 def _execute(theirs: Connection) -> None:
-    """Run in the attack process: execute the method and send the result."""
+    """Execute the method in the attack process, and send its result."""
     import traceback
 
     method, view, granted, rng = theirs.recv()

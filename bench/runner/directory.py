@@ -1,7 +1,7 @@
-"""The files of a run's folder beside its records: the plan, pictures, tracebacks, and the running jobs.
+"""Files in the folder of a run beside its records: the plan, pictures, tracebacks, and the running jobs.
 
-`bench status` reads these files alone. `plan.json` is the last plan of the folder. `running.json` lists the jobs that run.
-The lock on the records shows whether their process lives: the system lifts it when a process ends.
+`bench status` reads only these files and the records. `plan.json` is the last plan of the folder. `running.json` lists the
+running jobs. The lock on the records shows whether their process runs: the operating system releases it when the process ends.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ METADATA = ("task", "defense", "attack", "dataset", "seed", "experiment_id", "ru
 
 
 def reconstruction_path(out: Path, record: Record) -> Path:
-    """Return the path of a record's reconstruction. Records of schema 1 have theirs under `cell_id`."""
+    """Return the path of a record's reconstruction. For records of schema 1 the folder is `cell_id`."""
     return out / "reconstructions" / str(record.get("cell_id", record["experiment_id"])) / f"{record['sample']}.png"
 
 
 def photograph_path(out: Path, record: Record) -> Path:
-    """Return the path of a record's photograph as it was attacked; by content, as datasets may share names."""
+    """Return the path of a record's photograph, as it was attacked. Its folder is a hash: datasets can have equal names."""
     content = record["dataset"]["hash"].removeprefix("sha256:")[:16]
     return out / "photographs" / content / f"{record['sample']}.png"
 
@@ -96,14 +96,14 @@ def read_plan(out: Path) -> list[dict[str, Any]]:
     except FileNotFoundError:
         raise UserError(f"{path}: no such file; nothing was run there") from None
     except ValueError as error:
-        raise UserError(f"{path}: no JSON ({error}); repeat the run, and it is written anew") from None
+        raise UserError(f"{path}: no JSON ({error}); repeat the run to write the file again") from None
     if not all("experiments" in plan and "samples" in plan for plan in plans):
-        raise UserError(f"{path}: written by another version of this program; repeat the run, and it is written anew")
+        raise UserError(f"{path}: written by another version of this program; repeat the run to write the file again")
     return plans
 
 
 class RunningJobs:
-    """The jobs that run, in a file that exists while there are any."""
+    """The running jobs, in a file that exists during the run."""
 
     def __init__(self, out: Path, engine: str) -> None:
         self._path = out / RUNNING
@@ -118,7 +118,7 @@ class RunningJobs:
         self._path.unlink(missing_ok=True)
 
     def track(self, jobs: Iterable[Job]) -> Iterator[Job]:
-        """Yield the jobs, and note each when it is taken."""
+        """Yield the jobs, and add each to the file when it is taken."""
         for job in jobs:
             self._jobs[job.key] = None
             self._write()
@@ -129,12 +129,12 @@ class RunningJobs:
         self._jobs.pop(key(record), None)
 
     def _write(self) -> None:
-        with contextlib.suppress(OSError):  # it informs people, and no result depends on it
+        with contextlib.suppress(OSError):  # no result depends on this file
             _replace(self._path, self._writer | {"jobs": list(self._jobs)})
 
 
 def read_running(out: Path) -> dict[str, Any] | None:
-    """Read which process writes, or wrote when it ended without notice; None if none did."""
+    """Return the process that writes, or that ended before the run was complete; None if there is none."""
     try:
         return json.loads((out / RUNNING).read_bytes())
     except (OSError, ValueError):
@@ -142,7 +142,7 @@ def read_running(out: Path) -> dict[str, Any] | None:
 
 
 def _replace(path: Path, value: Any) -> None:
-    """Write in one step: a reader sees the old or the new content."""
+    """Write atomically: a reader gets the old or the new content."""
     unfinished = path.with_name(f"{path.name}.{os.getpid()}.unfinished")
     unfinished.write_text(json.dumps(value, allow_nan=False), encoding="utf-8")
     unfinished.replace(path)

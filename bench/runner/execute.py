@@ -1,6 +1,6 @@
-"""Executes plans: resumes, survives failures, and yields records.
+"""Execution of plans: yields records, resumes, and continues after failures.
 
-Every attack sees the same release. A resumed run gives the records of an uninterrupted one, whatever the engine.
+All attacks receive the same release. A resumed run gives the same records as an uninterrupted one, with every engine.
 """
 
 from __future__ import annotations
@@ -37,18 +37,18 @@ def run(
     Parameters
     ----------
     defenses, attacks : plugins, such as `[LDP(epsilon=10)]` and `[DIA()]`
-    images : a folder, files or sources, or None for the built-in photographs
+    images : a folder, files or sources; None for the built-in photographs
     extractor : `Sift()` if None
     task : `Reconstruction()` if None
     dataset : the scene, for a task that needs one
-    seed : of everything random. A release whose seed is known is for measuring and protects nobody.
-    metrics : metrics that need a setting, such as a file, beside all that need none
-    out : a folder for records and reconstructions; its finished records are not computed again
+    seed : seed of all random numbers. A release with a known seed is for measurements and protects nobody.
+    metrics : metrics that need a setting, such as a file; all other metrics are always computed
+    out : a folder for records and reconstructions; finished records in it are not computed again
 
     Raises
     ------
     UserError
-        if something is wrong with the arguments; nothing has been written then.
+        if an argument is invalid. Nothing has been written.
     """
     task = task or spec.read("reconstruction", discovery.TASK)
     configuration = RunConfiguration(
@@ -66,10 +66,10 @@ def run(
 
 
 def execute(plans: Sequence[Plan], out: Path | None = None, engine: Engine = IN_PROCESS) -> Iterator[Record]:
-    """Execute plans and yield their records: first those that `out` already holds, then new ones as they are computed.
+    """Execute plans and yield their records: first those in `out`, then new ones as they are computed.
 
-    An experiment that several plans share is executed once. Only one process at a time writes a folder, and only this process
-    does, whatever the engine. `sort_records` puts the records into the order of the plans.
+    An experiment that occurs in several plans is executed once. Only this process writes to `out`, with every engine, and no
+    other process can write there meanwhile. `sort_records` puts the records into the order of the plans.
 
     Parameters
     ----------
@@ -115,7 +115,7 @@ def _run_missing(
     engine: Engine,
     track: Callable[[Iterator[Job]], Iterator[Job]] = lambda jobs: jobs,
 ) -> Iterator[Result]:
-    """Yield the results that are not finished. First come those that do not apply and need no engine."""
+    """Yield the missing results. Those of experiments that do not apply need no engine and come first."""
     begun = set(finished)
     for experiment in (experiment for plan in plans for experiment in plan.experiments if experiment.reason is not None):
         if (key := (experiment.metadata["run_hash"], EVERY_SAMPLE)) not in begun:

@@ -1,4 +1,4 @@
-"""Exports features, releases and recovered descriptors to hloc's HDF5 files and COLMAP's databases.
+"""Export of features, releases and recovered descriptors to HDF5 files of hloc and databases of COLMAP.
 
 Keypoints refer to the photograph as stored. Each candidate of a word set becomes a keypoint of its own at the same coordinates,
 so that any matcher can match it.
@@ -23,12 +23,12 @@ from bench.types import Bytes, Descriptors, Floats, WordSets
 
 SIFT = 128  # components
 NORM = 512.0  # of 8-bit SIFT, as COLMAP quantises unit vectors
-HALF = 0.5  # hloc's centre of the first pixel is (0, 0)
+HALF = 0.5  # hloc puts the centre of the first pixel at (0, 0)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ImageFeatures:
-    """One photograph's keypoints and descriptors."""
+    """Keypoints and descriptors of one photograph."""
 
     name: str  # its path below the folder of photographs
     path: Path

@@ -1,8 +1,7 @@
-"""Releases that other users of a service would send: the knowledge `OtherReleases`.
+"""Releases of other users of a service: the knowledge `OtherReleases`.
 
-Other users' photographs are imitated by random windows, half of them mirrored, of the dataset's other photographs. So there is no
-limit to their number. They show the same few motifs again and again, but each is lifted anew, and attacks look for what liftings
-have in common.
+Random windows of the dataset's other photographs, half of them mirrored, stand for the photographs of other users. Their number
+is unlimited. They repeat the same few motifs, but each window is lifted anew, and attacks search for common parts of liftings.
 """
 
 from __future__ import annotations
@@ -21,15 +20,15 @@ from bench.core.errors import SampleError
 from bench.images.photographs import SIDE, Source, decode
 from bench.types import Bytes, Release
 
-LARGEST = 640  # pixels of the short side of the image that windows are cut from
+LARGEST = 640  # pixels: longest short side of the image that windows are cut from
 
 
 class ReleasePool:
-    """An endless list of releases of one defense. The k-th is a function of (randomness, k) alone and computed once.
+    """An endless sequence of releases of one defense. The k-th is a function of (randomness, k) alone, and is computed once.
 
     Parameters
     ----------
-    derive : from a name and k to a generator
+    derive : (name, k) -> generator
     """
 
     def __init__(
@@ -45,7 +44,7 @@ class ReleasePool:
         self._releases: dict[int, Release | None] = {}
 
     def without(self, photograph: str) -> Callable[[int], Iterator[Release]]:
-        """Return a function from a number to the first so many releases that show no window of that photograph."""
+        """Return a function: count -> the first `count` releases that show no window of that photograph."""
 
         def first(count: int) -> Iterator[Release]:
             usable = [number for number, source in enumerate(self._sources) if source.name != photograph]
@@ -55,7 +54,7 @@ class ReleasePool:
         return first
 
     def _iterate(self, numbers: Iterator[int], usable: int) -> Iterator[Release]:
-        """Yield releases, until as many windows in a row as there are photographs have no keypoint."""
+        """Yield releases. Stop after `usable` consecutive windows without a keypoint: as many as there are photographs."""
         missing = 0
         while missing < usable:
             k = next(numbers)
@@ -76,7 +75,7 @@ class ReleasePool:
 
 
 def random_window(source: Source, rng: np.random.Generator) -> Bytes:
-    """A random square of at least 256 pixels, or the largest there is, mirrored or not, resized to 256. -> (256, 256, 3)
+    """Return a random square of at least 256 pixels, or the largest one, mirrored or not, resized to 256. -> (256, 256, 3)
 
     Raises
     ------

@@ -19,12 +19,12 @@ from bench.runner.records import EVERY_SAMPLE, Record
 from bench.task_api import Execute, Task, execute_in_process
 from bench.threat_model import ServerMap
 
-Describe = Callable[[Iterable[object]], Mapping[str, Any]]  # from plugins to the environment that they run in
+Describe = Callable[[Iterable[object]], Mapping[str, Any]]  # plugins -> the environment that executes them
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RunConfiguration:
-    """The configuration of a run. It can be pickled, so that other processes build the same plan."""
+    """Configuration of a run. It can be pickled, so that other processes can build the same plan."""
 
     pairs: tuple[tuple[Defense, Attack | None], ...]
     images: Images
@@ -32,7 +32,7 @@ class RunConfiguration:
     extractor: Extractor
     dataset: Dataset | None
     seed: int
-    metrics: tuple[Metric, ...] = ()  # beside those that need no setting
+    metrics: tuple[Metric, ...] = ()  # in addition to those that need no setting
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,7 @@ class Experiment:
     defense: Defense
     attack: Attack | None
     privacy: Privacy
-    metadata: Record  # the part that all its records share
+    metadata: Record  # the entries that all its records have in common
     reason: str | None  # why it does not apply; None if it does
 
 
@@ -54,12 +54,12 @@ class Plan:
     task: Task
     experiments: tuple[Experiment, ...]
     samples: tuple[Sample, ...]
-    hashes: Mapping[str, str]  # sample's name -> its content's hash
+    hashes: Mapping[str, str]  # name of a sample -> hash of its content
     extractor: Extractor
     metrics: tuple[Metric, ...]
     public: Public
     seed: int
-    execute: Execute = execute_in_process  # of attacks
+    execute: Execute = execute_in_process  # executes the attacks
 
     @property
     def hash(self) -> str:
@@ -68,16 +68,16 @@ class Plan:
 
     @property
     def needs_map(self) -> bool:
-        """Whether some experiment asks for the server's map."""
+        """Whether an experiment uses the server's map."""
         attacks = (experiment.attack for experiment in self.experiments if experiment.attack is not None)
         return self.task.needs_map or any(ServerMap in attack.needs for attack in attacks)
 
     def __len__(self) -> int:
-        """The number of its records."""
+        """Return the number of records."""
         return sum(1 for _ in self.list_record_keys())
 
     def list_record_keys(self) -> Iterator[tuple[str, str]]:
-        """Yield the keys of its records, `run_hash` and sample, in order."""
+        """Yield the keys of the records, `run_hash` and sample, in order."""
         for number, sample in enumerate(self.samples):
             for experiment in self.experiments:
                 if experiment.reason is None:
@@ -87,30 +87,30 @@ class Plan:
 
 
 def cross(task: Task, defenses: Sequence[Defense], attacks: Sequence[Attack] = ()) -> tuple[tuple[Defense, Attack | None], ...]:
-    """Pair every defense with every attack, or with None where the task evaluates the release itself.
+    """Return every defense paired with every attack, or with None if the task evaluates the release itself.
 
     Raises
     ------
     UserError
-        if there is no defense, or the task needs attacks and has none or the other way round.
+        if there is no defense, no attack for a task that needs one, or an attack for a task that takes none.
     """
     if not defenses:
-        raise UserError("no defense was given")
+        raise UserError("no defense was given; give at least one")
     if task.judges_attacks and not attacks:
-        raise UserError(f"{task.name()} needs an attack")
+        raise UserError(f"the task {task.name()} needs an attack; give at least one")
     if not task.judges_attacks and attacks:
-        raise UserError(f"{task.name()} judges the release itself and takes no attack")
+        raise UserError(f"the task {task.name()} evaluates the release itself and takes no attack")
     candidates: Sequence[Attack | None] = attacks or [None]
     return tuple((defense, attack) for defense in defenses for attack in candidates)
 
 
 def build_plan(configuration: RunConfiguration, describe: Describe = environment.describe) -> Plan:
-    """Build the plan of a run. `describe` returns the environment in which it will be executed.
+    """Return the plan of a run. `describe` returns the environment that will execute it.
 
     Raises
     ------
     UserError
-        if something is wrong with the configuration.
+        if the configuration is invalid.
     """
     task, extractor, dataset, seed = configuration.task, configuration.extractor, configuration.dataset, configuration.seed
     collection = task.collect(configuration.images, dataset)

@@ -1,4 +1,4 @@
-"""Records: append-only JSON lines, one for each sample of each experiment. Everything that a person sees is derived from them."""
+"""Records: append-only JSON lines, one per sample of each experiment. All tables, plots and pages are derived from them."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ Record = dict[str, Any]
 
 SCHEMA = 2
 FILE = "records.jsonl"
-EVERY_SAMPLE = "*"  # the sample of a record that holds for the whole experiment, such as one that does not apply
+EVERY_SAMPLE = "*"  # in a record of a whole experiment, such as one that does not apply
 RENAMED_SINCE_1 = {"cell_id": "experiment_id", "unit": "sample"}  # keys of schema 1 -> keys of schema 2
 
 
 def experiment_id(task: Any, defense: Any, attack: Any, dataset: Mapping[str, Any], seed: int, metric_settings: Any) -> str:
-    """Hash the configuration and the inputs. The name of a dataset is neither."""
+    """Return the hash of the configuration and the inputs. The name of a dataset does not enter."""
     return short_hash([task, defense, attack, _content(dataset), seed, metric_settings])
 
 
 def run_hash(experiment: str, environment: Mapping[str, Any]) -> str:
-    """Hash the experiment and the environment: a record with the same one need not be computed again."""
+    """Return the hash of the experiment and the environment. A run skips records with an equal hash."""
     return short_hash([experiment, environment])
 
 
@@ -46,33 +46,34 @@ def seal(record: Mapping[str, Any]) -> Record:
 
 
 def key(record: Record) -> tuple[str, str]:
-    """Return the key of a record: of two that share it the later one counts."""
+    """Return the key of a record. Of several records with one key, the last one counts."""
     return record["run_hash"], record["sample"]
 
 
 @dataclass(frozen=True)
 class Contents:
-    """The contents of a file of records."""
+    """Contents of a file of records."""
 
     records: list[Record]
     whole: int  # bytes up to the end of the last whole line
-    notice: str | None = None  # of a last line that was cut off
+    notice: str | None = None  # a warning about an incomplete last line
 
 
 def read(path: Path) -> Contents:
-    """Read a file of records of schema 2 or 1; a last line that a crash cut off is left out.
+    """Read a file of records of schema 2 or 1. An incomplete last line, left by a crash, is skipped.
 
-    Records of schema 1 come out with the names and hashes of schema 2. Their `cell_id` stays: it names their pictures' folder.
+    Records of schema 1 are returned with the keys and hashes of schema 2. They retain `cell_id`, the name of their pictures'
+    folder.
 
     Raises
     ------
     UserError
-        if any other line is no record, or was changed after it was written; the message names the file and the line.
+        if another line is no record, or was changed after it was written; the message names file and line.
     """
     *lines, rest = path.read_bytes().split(b"\n")
     contents = [_parse(path, number, line) for number, line in enumerate(lines, start=1) if line.strip()]
     whole = sum(len(line) + 1 for line in lines)
-    notice = f"{path}: its last line was cut off and is left out" if rest else None
+    notice = f"{path}: the last line was cut off and is skipped" if rest else None
     return Contents(contents, whole, notice)
 
 
@@ -82,28 +83,28 @@ def keep_latest(records: Iterable[Record]) -> list[Record]:
 
 
 def find_file(path: str | Path) -> Path:
-    """Return the file of records: the file itself, or that of a folder which `bench run` wrote.
+    """Return the path of a file of records, from that path or from the folder of a run.
 
     Raises
     ------
     UserError
-        if there is none.
+        if there is no such file.
     """
     file = Path(path) / FILE if Path(path).is_dir() else Path(path)
     if not file.is_file():
-        raise UserError(f"{file}: no such file")
+        raise UserError(f"{file}: no such file; give a file of records, or a folder that `bench run` wrote")
     return file
 
 
 def load_records(path: str | Path) -> pd.DataFrame:
-    """Load the latest records of a file, or of a folder that `bench run` wrote, one a row.
+    """Return the latest records of a file, or of a folder that `bench run` wrote, as a DataFrame with one row per record.
 
-    Nested names become columns such as `metrics.ssim`; "inf" becomes infinity; absent entries are missing values.
+    Nested keys become columns such as `metrics.ssim`. The text "inf" becomes infinity. Absent entries are missing values.
 
     Raises
     ------
     UserError
-        if there is no such file, or a line of it is no record.
+        if there is no such file, or one of its lines is no record.
     """
     import pandas as pd
 
@@ -114,7 +115,7 @@ def load_records(path: str | Path) -> pd.DataFrame:
 
 
 def is_locked(path: Path) -> bool:
-    """Whether a living process is writing to that file of records."""
+    """Return whether a running process writes to that file of records."""
     if not path.is_file():
         return False
     lock = _file_lock(path)
@@ -123,25 +124,25 @@ def is_locked(path: Path) -> bool:
     except Timeout:
         return True
     except (OSError, NotImplementedError):
-        return False  # where nothing can be locked, nobody is known to write
+        return False  # a file system without locks, on which no writer can be detected
     lock.release()
     return False
 
 
 class Log:
-    """A file of records, open to append. Each record is handed to the system before the next job begins.
+    """A file of records, open to append. Each record is passed to the operating system before the next job begins.
 
-    The file is locked while it is open. The system lifts the lock when its process ends, however it ends. `before` holds the
-    contents at the time of locking.
+    The file is locked while it is open. The operating system releases the lock when the process ends, also after a crash.
+    `before` holds the contents at the time of locking.
     """
 
     def __init__(self, path: Path) -> None:
-        """Open the file, or create it, and cut off a last line that a crash left unfinished.
+        """Open the file, or create it, and remove an incomplete last line.
 
         Raises
         ------
         UserError
-            if the file cannot be written, holds something else, or another process writes to it.
+            if the file cannot be written, contains other data, or another process writes to it.
         """
         self._lock = _file_lock(path)
         try:
@@ -161,7 +162,7 @@ class Log:
         try:
             self._lock.acquire()
         except Timeout:
-            raise UserError(f"--out: another process is writing to {path}; wait for it, or name another folder") from None
+            raise UserError(f"--out: another process is writing to {path}; wait for it, or give another folder") from None
         except (OSError, NotImplementedError):  # a file system without locks
             logging.getLogger(__name__).debug("%s: cannot be locked", path)
 
@@ -172,12 +173,12 @@ class Log:
         self.close()
 
     def close(self) -> None:
-        """Close the file and lift the lock."""
+        """Close the file and release the lock."""
         self._file.close()
         self._lock.release()
 
     def append(self, record: Record) -> None:
-        """Write one record whole.
+        """Append one record, as a complete line.
 
         Raises
         ------
@@ -190,7 +191,7 @@ class Log:
 
 
 def explain_invalid(record: Any) -> str | None:
-    """Return why a value is no valid record of schema 2 or 1, by its hashes and its digest; None if it is one."""
+    """Return the reason why a value is no valid record of schema 2 or 1, by its hashes and its digest; None if it is valid."""
     if not isinstance(record, dict) or record.get("schema") not in (1, SCHEMA):
         return f"not a record of schema {SCHEMA} or 1"
     if record["schema"] == SCHEMA:
@@ -203,16 +204,16 @@ def explain_invalid(record: Any) -> str | None:
         experiment = short_hash([1, *_configuration(record)])
         run = run_hash(record["cell_id"], record["environment"])
     except (KeyError, TypeError, AttributeError) as error:
-        return f"not a whole record of schema 1 ({type(error).__name__}: {error})"
+        return f"an incomplete record of schema 1 ({type(error).__name__}: {error})"
     if experiment != record["cell_id"]:
-        return f"cell_id: is {record['cell_id']}, but that of this configuration is {experiment}"
+        return f"cell_id is {record['cell_id']}, but its configuration has {experiment}"
     if run != record["run_hash"]:
-        return f"run_hash: is {record['run_hash']}, but that of this cell and environment is {run}"
+        return f"run_hash is {record['run_hash']}, but its cell_id and environment have {run}"
     return None
 
 
 def upgrade(record: Record) -> Record:
-    """Return a valid record with the names and hashes of schema 2. One of schema 1 keeps its `cell_id`."""
+    """Return a valid record with the keys and hashes of schema 2. A record of schema 1 retains its `cell_id`."""
     if record["schema"] == SCHEMA:
         return record
     renamed = {RENAMED_SINCE_1.get(name, name): value for name, value in record.items()}
@@ -238,9 +239,9 @@ def _parse(path: Path, number: int, line: bytes) -> Record:
     try:
         record = json.loads(line)
     except (ValueError, RecursionError) as error:
-        raise UserError(f"{path}, line {number}: no JSON ({error}); mend or remove that line") from error
+        raise UserError(f"{path}, line {number}: no JSON ({error}); repair or remove the line") from error
     if (fault := explain_invalid(record)) is not None:
-        raise UserError(f"{path}, line {number}: {fault}; mend or remove that line")
+        raise UserError(f"{path}, line {number}: {fault}; repair or remove the line")
     return upgrade(record)
 
 

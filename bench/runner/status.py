@@ -1,4 +1,4 @@
-"""The status of a run, read from its folder: the plan, the records, and the running jobs."""
+"""Status of a run, from the files in its folder: the plan, the records, and the running jobs."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ class Count:
     """Numbers of samples by state. Each sample has one of these states."""
 
     done: int = 0
-    running: int = 0  # in a process that lives
-    failed: int = 0  # the next run tries them again
+    running: int = 0  # in a process that still runs
+    failed: int = 0  # the next run repeats them
     missing: int = 0
 
     def __add__(self, other: Count) -> Count:
@@ -32,7 +32,7 @@ class Count:
 class ExperimentStatus:
     """The status of one experiment."""
 
-    metadata: Mapping[str, Any]  # the part that its records share
+    metadata: Mapping[str, Any]  # the entries that its records have in common
     count: Count
     reason: str | None  # why it does not apply; None if it does
 
@@ -43,7 +43,7 @@ class Status:
 
     experiments: tuple[ExperimentStatus, ...]
     other: int  # records of other plans, or of other source, libraries or machines
-    writer: Mapping[str, Any] | None  # the process that writes, or that ended without notice
+    writer: Mapping[str, Any] | None  # the process that writes, or that ended before the run was complete
     alive: bool  # whether a process writes
 
     @property
@@ -95,11 +95,11 @@ def summarize(status: Status) -> str:
 
 def _describe_writer(status: Status) -> str:
     if status.writer is None:
-        return "" if not status.alive else "beginning"
+        return "" if not status.alive else "starting"
     since = datetime.fromtimestamp(status.writer["since"])
     process = f"process {status.writer['pid']} on {status.writer['host']}, since {since:%Y-%m-%d %H:%M}"
     writer = f"{status.writer['engine']} of {process}"
-    return f"running: {writer}" if status.alive else f"ended without notice: {writer}; repeat the command to go on"
+    return f"running: {writer}" if status.alive else f"ended early: {writer}; repeat the command to continue"
 
 
 def _state(key: tuple[str, str], latest: Mapping[tuple[str, str], Record], running: set[tuple[str, str]]) -> str:

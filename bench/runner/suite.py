@@ -1,4 +1,4 @@
-"""Suites: the experiments of `bench sweep`, as plain Python objects.
+"""Suites: the experiments of `bench sweep`, as Python objects.
 
 SUITE = Suite(
     summary="Does rounding help?",
@@ -83,12 +83,12 @@ def list_suites() -> list[str]:
 
 
 def find(text: str) -> Suite:
-    """Return the suite given by its name, as `module:NAME`, or as `path/to/file.py:NAME`.
+    """Return a suite by its name, by `module:NAME`, or by `path/to/file.py:NAME`.
 
     Raises
     ------
     UserError
-        if there is none, or its module cannot be imported.
+        if there is no such suite, or its module cannot be imported.
     """
     module_path, colon, attribute = text.rpartition(":")
     if not colon:
@@ -110,14 +110,14 @@ def find(text: str) -> Suite:
 
 
 def choose_folder(text: str) -> Path:
-    """Return the default results folder: `runs/sweep-` and the suite's name, or the names of its module and attribute."""
+    """Return the default folder of results: `runs/sweep-` and the suite's name, or the names of its module and attribute."""
     module_path, colon, attribute = text.rpartition(":")
     stem = Path(module_path).stem if module_path.endswith(".py") else module_path.rpartition(".")[2]
     return Path("runs") / f"sweep-{f'{stem}-{attribute}' if colon else text}"
 
 
 def _import_path(module_path: str) -> str:
-    """Return the module's import name. Puts a file's folder first on the import path, in worker processes too."""
+    """Return the import name of a module. The folder of a file is put first on the import path, also for worker processes."""
     if not module_path.endswith(".py"):
         return module_path
     file = Path(module_path).resolve()

@@ -1,8 +1,8 @@
-"""Executes one sample of one experiment at a time: read, extract, protect, evaluate, record.
+"""Execution of one sample of one experiment: read, extract, protect, evaluate, record.
 
-The randomness of a release is a function of (seed, photograph's content, defense, extractor) alone, never of the attack, the
-order, the process, or earlier samples. The strings "release", "device", "population", "attack", "rehearsal" and the keys of
-`provenance` enter that randomness and the keys of caches: they are data and keep their wording.
+The randomness of a release is a function of (seed, photograph's content, defense, extractor) alone. It does not depend on the
+attack, the order, the process, or earlier samples. The strings "release", "device", "population", "attack", "rehearsal" and the
+keys of `provenance` enter that randomness and the keys of caches. They are data, and their wording must not change.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from bench.types import Bytes, Features, Release
 
 @dataclass(frozen=True, kw_only=True)
 class Result:
-    """The record of one sample of one experiment, and the files that belong to it. Only `execute` writes them."""
+    """The record of one sample of one experiment, and its files. Only `execute` writes them."""
 
     record: Record
     reconstruction: bytes | None = None  # PNG
@@ -47,17 +47,17 @@ class Result:
 
 
 class TrialRunner:
-    """Executes the trials of a plan. Trials of one sample share its features and releases if they follow each other."""
+    """Executes the trials of a plan. Consecutive trials of one sample use the same features and releases."""
 
     def __init__(self, plan: Plan) -> None:
         self.plan = plan
-        self._order = hashing.digest(list(plan.hashes))  # in which other releases come
+        self._order = hashing.digest(list(plan.hashes))  # determines the order of other releases
         self._protect_sample = functools.lru_cache(maxsize=1)(self._protect_images)
         self._pool = functools.lru_cache(maxsize=None)(self._build_pool)
         self._pictured: str | None = None  # the sample whose photograph was last returned
 
     def execute(self, experiment: Experiment, sample: Sample) -> Result:
-        """Read, extract, protect and evaluate the sample, and return the result, also of a failure."""
+        """Read, extract, protect and evaluate the sample, and return the result. A failure gives a record, too."""
         try:
             return self._evaluate(experiment, sample)
         except (SampleError, UserError) as error:
@@ -70,7 +70,7 @@ class TrialRunner:
         self._protect_sample.cache_clear()
 
     def build_trial(self, experiment: Experiment, sample: Sample) -> Trial:
-        """Extract and protect a sample.
+        """Extract and protect a sample, and return the trial.
 
         Raises
         ------
@@ -80,7 +80,7 @@ class TrialRunner:
         plan, attack = self.plan, experiment.attack
         images, content = self._protect_sample(experiment.defense, sample), plan.hashes[sample.name]
         configurations = experiment.metadata["defense"], experiment.metadata["dataset"]["extractor"]
-        # Without the task's settings: an attack whose descriptors another inverter reconstructs draws the same numbers.
+        # Without the task's settings, so that an attack draws the same numbers if another inverter is chosen.
         configuration = attack and spec.to_json_with_digests(
             attack, plan.public, attack.assets(experiment.defense, plan.extractor, plan.public)
         )
@@ -105,15 +105,15 @@ class TrialRunner:
                 for number in range(1, 1 + (0 if attack is None else attack.repeats()))
             ),
             execute=plan.execute,
-            # A cached result would keep another process from executing the attack.
+            # With a cached result, the attack process would not execute the attack.
             provenance=provenance if plan.execute is execute_in_process else None,
         )
 
     def protect(self, experiment: Experiment, features: Features, content: str, *repetition: int | str) -> Release:
-        """Return the release of features whose photograph has that content hash; the first release has no `repetition`."""
+        """Return the release of the features of a photograph with that content hash. The first release has no `repetition`."""
         plan, defense = self.plan, experiment.defense
         configurations = experiment.metadata["defense"], experiment.metadata["dataset"]["extractor"]
-        if defense.is_memoized():  # all photographs, and all their repetitions, come from one device
+        if defense.is_memoized():  # all photographs and all repetitions belong to one device
             rng = derive_generator("device", plan.seed, *configurations)
         else:
             rng = derive_generator("release", plan.seed, content, *configurations, *repetition)
@@ -163,7 +163,7 @@ class TrialRunner:
 
 
 def dry_run(plan: Plan) -> None:
-    """Protect one keypoint of the first readable image by each defense, so that a mistake shows before anything is written.
+    """Protect one keypoint of the first readable image by each defense, to detect errors before anything is written.
 
     Raises
     ------
@@ -179,13 +179,13 @@ def dry_run(plan: Plan) -> None:
         except SampleError:
             continue
         for experiment in {experiment.defense: experiment for experiment in plan.experiments}.values():
-            with contextlib.suppress(SampleError):  # a plugin that raises gives failed records later
+            with contextlib.suppress(SampleError):  # the run writes failed records for a plugin that raises
                 runner.protect(experiment, features.take(np.arange(1)), "rehearsal")
         return
 
 
 def extract_sample(plan: Plan, sample: Sample) -> tuple[ExtractedImage, ...]:
-    """Return the images of a sample, read and extracted once, before they are protected.
+    """Return the images of a sample with their features. They are read and extracted once.
 
     Raises
     ------
@@ -197,7 +197,7 @@ def extract_sample(plan: Plan, sample: Sample) -> tuple[ExtractedImage, ...]:
 
 @functools.lru_cache(maxsize=1)
 def _extract_sample(extractor: Extractor, sample: Sample, content: str) -> tuple[ExtractedImage, ...]:
-    """`content` is the sample's hash: a file that has changed is read again."""
+    """Return the images. `content`, the hash of the sample, is part of the cache key: a changed file is read again."""
     return tuple(_extract_image(extractor, image) for image in sample.images)
 
 
@@ -230,7 +230,7 @@ def build_record(
     notes: Sequence[str] = (),
     seconds: float | None = None,
 ) -> Record:
-    """Return the record of a sample, or of all samples for None. `keypoints` are those of its image that has most."""
+    """Return the record of a sample, or of all samples for None. `keypoints` is the greatest number in one of its images."""
     estimates = {"estimates": dict(outcome.estimates)} if outcome is not None and outcome.estimates else {}
     return seal(
         experiment.metadata
@@ -249,9 +249,9 @@ def build_record(
 
 
 def build_privacy(experiment: Experiment, keypoints: int | None) -> dict[str, Any]:
-    """Return the guarantee for the release of one image, and what no guarantee covers."""
+    """Return the guarantee for the release of one image, and the parts that it does not cover."""
     epsilon, memoized = experiment.privacy.epsilon, experiment.defense.is_memoized()
-    # A memoized defense answers once, however often it is asked.
+    # A memoized defense repeats its answers, so all releases count as one.
     releases = 1 if memoized or experiment.attack is None else 1 + experiment.attack.repeats()
     image: dict[str, float | str | None] = {"epsilon_image": None, "epsilon_image_optimal": None}
     if epsilon is not None and keypoints is not None:
@@ -264,13 +264,13 @@ def build_privacy(experiment: Experiment, keypoints: int | None) -> dict[str, An
         "epsilon_descriptor": spec.encode_infinity(epsilon),
         **({} if per_distance is None else {"epsilon_per_distance": float(per_distance)}),
         "keypoints": keypoints,
-        "releases": releases,  # of the photograph
+        "releases": releases,  # number of releases of the photograph
         **image,
-        "delta": composition.DELTA,  # of the optimal one
+        "delta": composition.DELTA,  # of the optimal composition
         "uncovered": [*composition.UNCOVERED, *([composition.LINKS] if memoized else [])],
         "log10_true": experiment.privacy.log10_true,
         "seeded": True,
-        "private": False,  # a seeded release is for measuring
+        "private": False,  # a seeded release is for measurements
     }
 
 

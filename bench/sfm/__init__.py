@@ -1,1 +1,1 @@
-"""Structure from motion of releases: selection and verification of matches, and COLMAP's mapping."""
+"""Structure from motion from releases: selection and verification of matches, and COLMAP's mapping."""

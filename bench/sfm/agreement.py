@@ -1,8 +1,8 @@
-"""Agreement of the cameras of structure from motion with the true ones, up to a similarity.
+"""Agreement of the cameras of structure from motion with the true cameras, up to a similarity.
 
-Positions alone leave the rotation about the line of a straight walk undetermined, so rotations count as well. Every two images a
-and b propose the similarity that maps a to its true pose and b to its true distance from a. The one with most agreeing images
-wins.
+Positions alone do not determine the rotation about the line of a straight walk, so rotations must agree, too. Each pair of images
+a and b proposes a similarity, which maps a to its true pose and b to its true distance from a. The similarity with most agreeing
+images is selected.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ MAX_ANGLE = 5.0  # degrees
 
 
 def count_correct_poses(model: Model, truth: Sequence[pycolmap.Rigid3d]) -> int:
-    """Count the registered images whose pose is within `MAX_OFFSET` and `MAX_ANGLE` of the true one.
+    """Return the number of registered images whose pose is within `MAX_OFFSET` and `MAX_ANGLE` of the true pose.
 
     Parameters
     ----------

@@ -1,13 +1,13 @@
 """Selection of true matches among many accidental ones: true matches have neighbours with similar displacements.
 
-Between two releases of word sets most matches are accidental: with N keypoints of m words each, of |K| words, about
+Between two releases of word sets most matches are accidental. With N keypoints of m words each, of |K| words, about
 
     |K| (λ e^-λ)²,    λ = N m / |K|,
 
-words are unique in both images by chance. These scatter; the displacements of true matches vary smoothly over the image. The
-support of a match is the number of nearby matches with a similar displacement (grid-based motion statistics: Bian et al.,
-CVPR 2017). The half with least support is dropped repeatedly: support by chance falls with the number of matches, and the support
-that true matches give each other stays.
+words are unique in both images by chance. Displacements of accidental matches scatter. Displacements of true matches vary
+smoothly over the image. The support of a match is the number of nearby matches with a similar displacement (grid-based motion
+statistics: Bian et al., CVPR 2017). The half of the matches with least support is dropped repeatedly. This reduces support by
+chance, but not the support that true matches give each other.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ Doubles = NDArray[np.float64]
 NEAR = 0.1  # half the side of the neighbourhood, as a fraction of the image's longer side
 SIMILAR = 0.025  # the same for displacements
 SIGNIFICANCE = 0.05  # level at which support counts as more than chance
-CLEAN_FRACTION = 0.8  # of the matches with significant support; then no more are dropped
-MAX_CLEAN = 2000  # as many matches as an image has keypoints; of more, most are accidental
+CLEAN_FRACTION = 0.8  # fraction of matches with significant support at which no more matches are dropped
+MAX_CLEAN = 2000  # as many matches as an image has keypoints; if there are more, most are accidental
 
 
 def count_support(first: Doubles, second: Doubles, near: float, similar: float) -> Indices:
-    """Count for each match the other matches nearby with a similar displacement. (M, 2), (M, 2) pixels -> (M,)
+    """Return for each match the number of other nearby matches with a similar displacement. (M, 2), (M, 2) pixels -> (M,)
 
     Parameters
     ----------
@@ -40,13 +40,14 @@ def count_support(first: Doubles, second: Doubles, near: float, similar: float) 
 
 
 def select_consistent(first: Doubles, second: Doubles, longer: float, minimum: int, rng: np.random.Generator) -> Indices:
-    """Select the matches that support each other. (M, 2), (M, 2) pixels -> (M',) their rows, ascending
+    """Return the matches that support each other. (M, 2), (M, 2) pixels -> (M',) their rows, ascending
 
-    Stops when 80% of the remaining matches have more support than 95% of the same matches shuffled, or when `minimum` remain.
+    The selection stops if 80% of the remaining matches have more support than 95% of the same matches shuffled, or if `minimum`
+    remain.
 
     Parameters
     ----------
-    longer : of the image's sides, in pixels
+    longer : longer side of the image, in pixels
     """
     left = np.arange(len(first))
     near, similar = NEAR * longer, SIMILAR * longer
@@ -61,12 +62,12 @@ def select_consistent(first: Doubles, second: Doubles, longer: float, minimum: i
 
 
 def _is_clean(support: Indices, chance: Indices) -> bool:
-    """Whether enough matches have more support than shuffled ones."""
+    """Return whether enough matches have more support than shuffled ones."""
     return bool((support > np.quantile(chance, 1 - SIGNIFICANCE)).mean() >= CLEAN_FRACTION)
 
 
 def find_supported(first: Doubles, second: Doubles, trusted: Indices, longer: float) -> Indices:
-    """Find the matches near another, trusted match with a similar displacement. -> (M',) their rows, ascending"""
+    """Return the matches near another, trusted match with a similar displacement. -> (M',) their rows, ascending"""
     from scipy.spatial import cKDTree
 
     points = _embed(first, second, NEAR * longer, SIMILAR * longer)
@@ -76,5 +77,5 @@ def find_supported(first: Doubles, second: Doubles, trusted: Indices, longer: fl
 
 
 def _embed(first: Doubles, second: Doubles, near: float, similar: float) -> Doubles:
-    """Map matches to points that differ by at most 1 along each axis if near with similar displacements. -> (M, 4)"""
+    """Return matches as points that differ by at most 1 along each axis if they are near and similar. -> (M, 4)"""
     return np.concatenate([first / near, (second - first) / similar], axis=1)

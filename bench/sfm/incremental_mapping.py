@@ -1,8 +1,9 @@
-"""Structure from motion by COLMAP, incremental or global: verified pairs go through `pycolmap.Database` to its mapping.
+"""Structure from motion by COLMAP, incremental or global, from verified pairs of images.
 
-Incremental mapping (Schönberger and Frahm, CVPR 2016) starts with the points of two images and adds images that see enough of
-them. In private releases few points are seen again. Global mapping (Pan et al., ECCV 2024) estimates all poses together from the
-geometry of all pairs. Intrinsics are known, shared and fixed. One thread and a seed: the same matches give the same model.
+Incremental mapping (Schönberger and Frahm, CVPR 2016) starts with the points of two images and adds images that show enough of
+them. In private releases, few points occur in a third image. Global mapping (Pan et al., ECCV 2024) estimates all poses together
+from the geometry of all pairs. COLMAP reads the pairs from a `pycolmap.Database`. Intrinsics are known, common to all images and
+fixed. With one thread and a seed, the same matches give the same model.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
 Mapper = Literal["incremental", "global"]
 
-MIN_POINTS = 15  # seen by each image of a model; COLMAP's default to add an image is 30, and a private release has fewer
+MIN_POINTS = 15  # in each image of a model; COLMAP adds an image from 30 by default, which private releases do not reach
 MIN_IMAGES = 3  # of a model
 
 
@@ -33,7 +34,7 @@ MIN_IMAGES = 3  # of a model
 class Model:
     """A model with its registered images."""
 
-    images: tuple[int, ...]  # the registered ones, ascending
+    images: tuple[int, ...]  # the registered images, ascending
     poses: tuple[pycolmap.Rigid3d, ...]  # cam_from_world of each
     points: Doubles  # (P, 3)
     observations: int
@@ -53,9 +54,9 @@ class Model:
 def build_model(
     camera: pycolmap.Camera, keypoints: Sequence[Floats], geometries: Mapping[Pair, Geometry], mapper: Mapper, seed: int
 ) -> Model | None:
-    """Build the model with most images, and of those with most points; None if no model has `MIN_IMAGES` images.
+    """Return the model with most images, and among equals with most points; None if no model has `MIN_IMAGES` images.
 
-    Global mapping registers every image that a chain of pairs leads to. Images that see fewer than `MIN_POINTS` are dropped.
+    Global mapping registers every image that a chain of pairs reaches. Images with fewer than `MIN_POINTS` points are dropped.
 
     Parameters
     ----------
@@ -108,7 +109,7 @@ def _global_options(seed: int) -> pycolmap.GlobalPipelineOptions:
 def _write_database(
     database: Path, camera: pycolmap.Camera, keypoints: Sequence[Floats], geometries: Mapping[Pair, Geometry]
 ) -> None:
-    """Write all that mapping needs into a database. Numbers count from 1."""
+    """Write a database with all inputs of the mapping. Numbers count from 1."""
     import pycolmap
 
     model = pycolmap.Reconstruction()

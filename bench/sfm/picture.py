@@ -16,7 +16,7 @@ POINT, CAMERA, PAPER = (90, 90, 90), (200, 30, 30), (255, 255, 255)
 
 
 def draw_from_above(model: Model) -> Floats:
-    """Draw points as dots, and cameras as wedges that open in the viewing direction. -> (SIDE, SIDE, 3) in [0, 1]
+    """Return a drawing: points are dots, cameras are wedges that open in the viewing direction. -> (SIDE, SIDE, 3) in [0, 1]
 
     The vertical is the mean vertical of the images. The mean viewing direction points up on the page.
     """
@@ -48,7 +48,7 @@ def draw_from_above(model: Model) -> Floats:
 
 
 def _compute_axes(model: Model) -> Doubles:
-    """Compute the directions right and forwards on the ground. -> (2, 3)"""
+    """Return the directions right and forwards on the ground. -> (2, 3)"""
     rotations = np.array([pose.rotation.matrix() for pose in model.poses])  # (V, 3, 3)
     up = -rotations[:, 1].mean(axis=0)
     up /= np.linalg.norm(up)

@@ -1,8 +1,9 @@
 """Verification of image pairs: an essential matrix by RANSAC, among the consistent matches.
 
-Where nearly all matches are accidental, some agree with any result of RANSAC. Their number is measured: the same is done for some
-pairs with shuffled matches. A geometry counts if a larger fraction of matches agrees with it than with any of those. Finally all
-matches are tested again: one counts if it agrees with the geometry and has a displacement similar to an inlier's nearby.
+If nearly all matches are accidental, some of them agree with any result of RANSAC. To measure their number, some pairs are also
+verified with shuffled matches. A geometry counts if a larger fraction of matches agrees with it than in every shuffled pair.
+Finally all matches are tested again. A match counts if it agrees with the geometry and has a displacement similar to that of a
+nearby inlier.
 """
 
 from __future__ import annotations
@@ -24,9 +25,9 @@ if TYPE_CHECKING:
 MAX_ERROR = 3.0  # pixels off the epipolar line, in COLMAP's Sampson error
 TRIALS = 10_000  # of RANSAC
 CONFIDENCE = 0.9999
-MIN_CONSISTENT = 100  # consistent matches that are selected, if there are as many
-MIN_MATCHES = 15  # inliers of a geometry, COLMAP's own bound
-SAMPLE = 5  # matches that RANSAC fits: they agree in any case
+MIN_CONSISTENT = 100  # least number of selected consistent matches, unless there are fewer matches
+MIN_MATCHES = 15  # least number of inliers of a geometry, as in COLMAP
+SAMPLE = 5  # matches that RANSAC fits, which agree in any case
 SHUFFLED_PAIRS = 32  # approximate number of pairs with shuffled matches
 
 Pair = tuple[int, int]
@@ -37,16 +38,16 @@ Matches = Mapping[Pair, Indices]  # images a < b -> (M, 2) keypoints of a, of b
 class Geometry:
     """The relative pose of two images, and their matches."""
 
-    matches: Indices  # (M, 2) that agree with the pose
+    matches: Indices  # (M, 2) matches that agree with the pose
     essential: Doubles  # (3, 3)
     second_from_first: pycolmap.Rigid3d  # the translation has no length
-    rate: float  # fraction of the consistent matches that agreed, without the sample that RANSAC fitted
+    rate: float  # fraction of the consistent matches that agree, without the sample that RANSAC fits
 
 
 def verify_pairs(
     camera: pycolmap.Camera, keypoints: Sequence[Floats], matches: Matches, seed: int, threads: int = 2
 ) -> dict[Pair, Geometry]:
-    """Return the pairs whose geometry is more than chance, in the order of `matches`.
+    """Return the pairs whose geometry exceeds chance, in the order of `matches`.
 
     Parameters
     ----------
@@ -79,7 +80,7 @@ def verify_pairs(
 def estimate_geometry(
     camera: pycolmap.Camera, first: Floats, second: Floats, matches: Indices, rng: np.random.Generator
 ) -> Geometry | None:
-    """Estimate the geometry that most of the consistent matches agree with; None if they are too few.
+    """Return the geometry with which most of the consistent matches agree; None if too few agree.
 
     Parameters
     ----------
@@ -91,7 +92,7 @@ def estimate_geometry(
     a, b = first[matches[:, 0]].astype(np.float64), second[matches[:, 1]].astype(np.float64)  # (M, 2) pixels
     longer = float(max(camera.width, camera.height))
     consistent = select_consistent(a, b, longer, MIN_CONSISTENT, rng)
-    # A large min_inlier_ratio would stop RANSAC before TRIALS.
+    # With a large min_inlier_ratio, RANSAC would stop before TRIALS.
     options = pycolmap.RANSACOptions(
         max_error=MAX_ERROR,
         max_num_trials=TRIALS,
@@ -114,7 +115,7 @@ def estimate_geometry(
 
 
 def _compute_errors(camera: pycolmap.Camera, first: Doubles, second: Doubles, essential: Doubles) -> Doubles:
-    """Compute Sampson errors in pixels. (M, 2), (M, 2) pixels -> (M,)"""
+    """Return Sampson errors in pixels. (M, 2), (M, 2) pixels -> (M,)"""
     import pycolmap
 
     if len(first) == 0:

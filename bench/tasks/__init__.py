@@ -1,1 +1,1 @@
-"""What a release is judged by."""
+"""Tasks: measures of releases and of attacks on them, one file each."""

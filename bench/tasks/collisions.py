@@ -1,14 +1,14 @@
 """Collisions: whether subspaces that intersect a subspace also come near its descriptor (the paper's Table S4).
 
-The clustering attack separates d from the adversarial a_i by the subspaces Q' that intersect D, of the same release and of
-others. They pass through some a_i and should stay far from d. The paper does not state its test; here a descriptor has no
+The clustering attack separates d from the adversarial a_i by the subspaces Q' that intersect D. The Q' belong to the same release
+and to other releases. They contain some a_i and should be far from d. The paper does not state its test. Here a descriptor has no
 collision if
 
     min_j dist(d, Q'_j) > max_i min_j dist(a_i, Q'_j) + τ
 
-An a_i on no other subspace makes the right side large and counts as a collision, as does a descriptor without Q'. `coverage` is
-the fraction of the a_i that other subspaces pass through. `no_collision_covered` is the fraction among descriptors with all a_i
-covered.
+An a_i that no other subspace contains makes the right side large and counts as a collision. A descriptor without any Q' counts
+as a collision, too. `coverage` is the fraction of the a_i in other subspaces. `no_collision_covered` is the fraction without
+collision among the descriptors whose a_i are all in other subspaces.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ from bench.task_api import Outcome, Task, Trial
 
 @dataclass(frozen=True, kw_only=True)
 class Collisions(Task):
-    """How often no subspace that intersects another comes near its descriptor. Computed by the owner."""
+    """Fraction of descriptors that no intersecting subspace comes near (no collision). Computed by the owner."""
 
     judges_attacks = False
 
     coverage: float = 0.95  # other releases are drawn until this fraction of the photograph's words is covered
-    others: int = 800  # releases of other photographs, at most
+    others: int = 800  # largest number of releases of other photographs
     tolerance: float = 0.3  # τ, a distance of unit descriptors
 
     def __post_init__(self) -> None:
@@ -85,7 +85,7 @@ class Collisions(Task):
 
 
 def is_collision_free(nearest: Doubles, tolerance: float) -> NDArray[np.bool_]:
-    """Whether d, the first point, is further from other subspaces than all a_i, by more than `tolerance`. (N, 1 + a) -> (N,)"""
+    """Return whether the distance of d, the first point, exceeds those of all a_i by more than `tolerance`. (N, 1 + a) -> (N,)"""
     own, adversarial = nearest[:, 0], nearest[:, 1:].max(axis=1)
     return np.isfinite(own) & (own > adversarial + tolerance)
 

@@ -1,14 +1,16 @@
-"""Intersections: whether the words near a subspace lie around the points that it goes through (the paper's Table S3).
+"""Intersections: whether the words near a subspace match the descriptors in it (the paper's Table S3).
 
 The paper: "for each subspace, we select the top N database descriptors closest to the subspace, and match them to the m/2 + 1
 descriptors forming the subspace. Using the standard ratio test we report the percentage of successful matches."
 
 Here the N words of the database nearest to the subspace, without the m/2 adversarial ones, are matched to d and the a_i. A match
 succeeds if the nearest of those m/2 + 1 points is less than 0.8 times as far as the second nearest.
+
 With the adversarial words among the N, success at N = 5 and m = 16 is 100% by construction: five of the eight words in the
-subspace match themselves. The paper prints 94.38%. That fraction is recorded as `with_adversarial_top5` and so on.
-Matching the other way, each of the m/2 + 1 points to its nearest among the N words, succeeds more often as m grows, because all
-a_i are words and match themselves; the paper's success falls.
+subspace match themselves. The paper prints 94.38%. These fractions are recorded as `with_adversarial_top5` and so on.
+
+The opposite direction matches each of the m/2 + 1 points to its nearest among the N words. Its success grows with m, because all
+a_i are words and match themselves. The paper's success falls with m.
 """
 
 from __future__ import annotations
@@ -36,15 +38,15 @@ BATCH = 64  # subspaces
 
 @dataclass(frozen=True, kw_only=True)
 class Intersections(Task):
-    """How often the words nearest to a subspace match one of the points that it goes through. Computed by the owner.
+    """Fraction of the words nearest to a subspace that match one of the descriptors in it. Computed by the owner.
 
-    The descriptors of a photograph are lifted repeatedly until there are `subspaces` liftings, or each once for 0.
+    The descriptors of a photograph are lifted repeatedly until there are `subspaces` liftings. For 0, each is lifted once.
     """
 
     judges_attacks = False
 
-    ratio: float = 0.8  # of the distances to the nearest and the second nearest; a match is below it
-    subspaces: int = 0  # lifted of each photograph
+    ratio: float = 0.8  # upper limit of the ratio of the distances to the nearest and the second nearest point
+    subspaces: int = 0  # number of liftings per photograph; 0: one per descriptor
 
     def __post_init__(self) -> None:
         if not 0 < self.ratio <= 1:
@@ -90,7 +92,7 @@ class Intersections(Task):
 
 
 def draw_rounds(secret: Features, count: int, rng: np.random.Generator) -> Iterator[Features]:
-    """Yield the descriptors in random order, repeatedly, until there are `count` of them."""
+    """Yield all descriptors repeatedly, and finally a random subset, so that there are `count` of them in total."""
     while count > 0:
         rows = np.sort(rng.permutation(len(secret))[:count])
         yield secret.take(rows)
@@ -98,7 +100,7 @@ def draw_rounds(secret: Features, count: int, rng: np.random.Generator) -> Itera
 
 
 def pass_ratio_test(words: Floats, points: Floats, ratio: float) -> NDArray[np.bool_]:
-    """Whether a word's nearest point is less than `ratio` times as far as its second nearest. (n, N, D), (n, p, D) -> (n, N)"""
+    """Return whether a word's nearest point is below `ratio` times the distance of its second. (n, N, D), (n, p, D) -> (n, N)"""
     distances = np.linalg.norm(words[:, :, None].astype(np.float64) - points[:, None], axis=3)  # (n, N, p)
     nearest, second = np.moveaxis(np.partition(distances, 1, axis=2)[:, :, :2], 2, 0)
     return nearest < ratio * second
@@ -111,7 +113,7 @@ def drop_left_out(match: NDArray[np.bool_], left_out: NDArray[np.bool_], count: 
 
 
 def _compute_fractions(name: str, match: list[NDArray[np.bool_]]) -> dict[str, float]:
-    """Compute the fraction of successes among the first N columns, for each N."""
+    """Return the fraction of successes among the first N columns, for each N."""
     rows = np.concatenate(match)
     return {f"{name}_top{count}": float(rows[:, :count].mean()) for count in COUNTS}
 

@@ -32,21 +32,21 @@ THRESHOLDS = {"0.25m_2deg": (0.25, 2.0), "0.5m_5deg": (0.5, 5.0), "5m_10deg": (5
 
 @dataclass(frozen=True, kw_only=True)
 class Localization(Task):
-    """How many queries of a scene a server can localize from their releases.
+    """Fraction of the queries of a scene that a server can localize from their releases.
 
-    Retrieval is `raw` (by the query's raw descriptors, the same for every defense, as in the paper, which does not count this
-    leak) or `released` (by the release alone), unless a file of pairs is given.
+    Retrieval `raw` uses the query's raw descriptors, so it is the same for every defense. The paper does so, and does not count
+    this leak. Retrieval `released` uses the release alone. A file of `pairs` replaces retrieval.
     """
 
     judges_attacks: ClassVar[bool] = False
     needs_scene: ClassVar[bool] = True
     needs_map: ClassVar[bool] = True
 
-    # auto: the best one for the release among those that do not lift references
+    # auto: the best matcher for the release among those that do not lift references
     matcher: Literal["auto", "vocabulary", "noisy-nn", "mutual-nn", "point-to-subspace", "subspace-to-subspace"] = "auto"
     retrieval: Literal["raw", "released"] = "raw"
     retrieved: int = 20  # references per query
-    trials: int = 30_000  # of RANSAC, at most
+    trials: int = 30_000  # largest number of RANSAC trials
     pairs: Path | None = None  # a file of retrieved references in hloc's format
 
     def __post_init__(self) -> None:
@@ -105,7 +105,7 @@ class Localization(Task):
 
 
 def _check_intrinsics(server: Server, secret: Features, query: str) -> None:
-    """Raise SampleError if the intrinsics are wrong, judged by raw features, so that all defenses have the same queries."""
+    """Raise SampleError if the intrinsics are wrong. Raw features decide, so that all defenses have the same queries."""
     mismatches = server.scene_index.focal_mismatches
     if query not in mismatches:
         mismatches[query] = server.estimate_focal_mismatch(secret)
@@ -114,7 +114,7 @@ def _check_intrinsics(server: Server, secret: Features, query: str) -> None:
 
 
 def score_pose(errors: tuple[float, float] | None) -> dict[str, float | None]:
-    """Score a pose by thresholds and errors; None is a query that was not localized."""
+    """Return the metrics of a pose with these errors; None stands for a query that was not localized."""
     translation, rotation = (None, None) if errors is None else errors
     recalls = {
         f"recall_{name}": float(errors is not None and errors[0] <= length and errors[1] <= angle)
@@ -124,7 +124,7 @@ def score_pose(errors: tuple[float, float] | None) -> dict[str, float | None]:
 
 
 def look_up_pairs(path: Path, query: str, names: tuple[str, ...]) -> Indices:
-    """Look up the references that a file of pairs lists for a query.
+    """Return the references that a file of pairs lists for a query.
 
     Raises
     ------

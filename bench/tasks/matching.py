@@ -1,14 +1,14 @@
 """Matching: accuracy of a server's matches between two views of a plane, with one or both views privatised.
 
-With H the homography from the first image to the second, the error of a match (i, j) is |H x_i − x_j| pixels. A match is correct
-below `MAX_ERROR`, and
+H is the homography from the first image to the second. The error of a match (i, j) is |H x_i − x_j| pixels. A match is correct if
+its error is below `MAX_ERROR`. A true correspondence of a keypoint is a keypoint of the second image at an error below
+`MAX_ERROR`.
 
 - mean matching accuracy at t: the fraction of matches with an error below t;
 - precision: the fraction of correct matches, which is the accuracy at `MAX_ERROR`;
-- recall: among the keypoints of the first image with a true correspondence (a keypoint of the second at an error below
-  `MAX_ERROR`), the fraction with a correct match.
+- recall: the fraction of the first image's keypoints with a true correspondence that have a correct match.
 
-Without any match all are zero. (Mikolajczyk and Schmid, PAMI 2005; Dusmanu et al., CVPR 2019.)
+Without any match all are zero. Sources: Mikolajczyk and Schmid, PAMI 2005; Dusmanu et al., CVPR 2019.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ SEED = 0  # of the rendered pairs
 
 @dataclass(frozen=True, kw_only=True)
 class Matching(Task):
-    """How well two views of a plane are matched: rendered views of the built-in photographs, or a folder of HPatches.
+    """Accuracy of matches between two views of a plane: rendered views of the built-in photographs, or a folder of HPatches.
 
     The first image is privatised; the second only with `both`.
     """
@@ -60,11 +60,11 @@ class Matching(Task):
 
     def collect(self, images: Images, dataset: Dataset | None) -> Collection:
         if dataset is not None:
-            raise UserError("matching judges pairs of images and takes no dataset; give --images with a folder of HPatches")
+            raise UserError("matching takes pairs of images, not a dataset; give --images with a folder of HPatches")
         if images is None:
             return _build_collection("pairs", homographies.create_pairs(SEED, self.each))
         if not isinstance(images, (str, Path)):
-            raise UserError("matching judges pairs of images; give a folder of HPatches")
+            raise UserError("matching takes pairs of images; give a folder of HPatches")
         return _build_collection(Path(images).resolve().name, homographies.load_hpatches(Path(images)))
 
     def explain_not_applicable(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> str | None:
@@ -90,7 +90,7 @@ class Matching(Task):
 
 
 def compute_accuracy(first: Floats, second: Floats, homography: Doubles, matches: Indices) -> dict[str, float | None]:
-    """Compute the metrics defined at the top of this file; recall is None if no keypoint has a true correspondence.
+    """Return the metrics defined at the top of this file; recall is None if no keypoint has a true correspondence.
 
     Parameters
     ----------
@@ -117,7 +117,7 @@ def compute_accuracy(first: Floats, second: Floats, homography: Doubles, matches
 
 
 def transfer(points: Floats, homography: Doubles) -> Doubles:
-    """Transfer points of the first image to the second; infinite on and beyond the horizon. (N, 2) -> (N, 2)"""
+    """Return points of the first image in the second; infinite on and beyond the horizon. (N, 2) -> (N, 2)"""
     homogeneous = np.concatenate([points, np.ones((len(points), 1))], axis=1, dtype=np.float64) @ homography.T  # (N, 3)
     depth = np.where(homogeneous[:, 2:] > 0, homogeneous[:, 2:], 0.0)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -1,4 +1,4 @@
-"""Reconstruction: how well an attacker recovers the photograph and its descriptors from a release."""
+"""Reconstruction: accuracy of an attacker's image and descriptors, recovered from a release."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ RELEASES = {OtherReleases, RepeatedReleases}  # available for every defense
 
 @dataclass(frozen=True, kw_only=True)
 class Reconstruction(Task):
-    """Compares the attacker's image with the photograph, and their descriptors with the true ones.
+    """Comparison of the attacker's image with the photograph, and of the attacker's descriptors with the true ones.
 
-    If an attack recovers descriptors, the `inverter` reconstructs the image from them: the network for raw descriptors.
+    If an attack recovers descriptors, the `inverter` reconstructs the image from them with the network for raw descriptors.
     """
 
     judges_attacks = True
@@ -106,7 +106,7 @@ class Reconstruction(Task):
 
 
 def offer_knowledge(attack: Attack, defense: Defense, public: Public) -> dict[type[Knowledge], Callable[[], Knowledge]]:
-    """Return loaders of all knowledge except releases of that defense and the server's map."""
+    """Return a loader for each kind of knowledge, except releases of that defense and the server's map."""
     databases = fields.list_assets(defense)
     own = fields.list_assets(attack).get("database", "shipped-public")
     offers: dict[type[Knowledge], Callable[[], Knowledge]] = {
@@ -119,7 +119,7 @@ def offer_knowledge(attack: Attack, defense: Defense, public: Public) -> dict[ty
 
 
 def build_view(trial: Trial) -> View:
-    """Return the attack's input: copies of the releases, and of other knowledge only what the attack declares in `needs`."""
+    """Return the attack's input: copies of the releases, and the knowledge that the attack declares in `needs`."""
     attack = trial.attack
     assert attack is not None
     offers = offer_knowledge(attack, trial.defense, trial.public) | {
@@ -128,7 +128,7 @@ def build_view(trial: Trial) -> View:
         ServerMap: lambda: _build_server_map(trial),
     }
     return View(
-        release=copy.deepcopy(trial.release),  # an attack cannot change what the next one gets
+        release=copy.deepcopy(trial.release),  # an attack cannot change the input of the next attack
         defense=trial.defense,
         extractor=trial.extractor,
         knowledge={kind: load for kind, load in offers.items() if kind in attack.needs},
@@ -142,7 +142,7 @@ def _build_server_map(trial: Trial) -> ServerMap:
 
 
 def reconstruct_image(attack: ImageAttack, view: View, trial: Trial) -> Floats:
-    """Run the attack and check its image. -> (H, W, 3)"""
+    """Run the attack, check its image, and return it. -> (H, W, 3)"""
     with wrap_plugin_errors(f"plugin {attack.name()}"):
         image: Floats = trial.execute(attack.reconstruct, view, trial.rng)
         width, height = view.release.size
@@ -153,7 +153,7 @@ def reconstruct_image(attack: ImageAttack, view: View, trial: Trial) -> Floats:
 
 
 def compute_metrics(trial: Trial, selection: Selection | None, image: Floats | None, notes: tuple[str, ...] = ()) -> Outcome:
-    """Compute every metric of the image and the descriptors; None where one is missing. With a foreground, its parts as well."""
+    """Compute all metrics; None if the image or the descriptors are missing. With a foreground, also those of both parts."""
     values: dict[str, float | None] = {}
     truth = (trial.pixels() / 255.0).astype(np.float32)
     for metric in trial.metrics:
@@ -171,7 +171,7 @@ def compute_metrics(trial: Trial, selection: Selection | None, image: Floats | N
 
 
 def compute_part_metrics(metrics: Sequence[Metric], truth: Floats, image: Floats, mask: Mask) -> dict[str, float | None]:
-    """Compute each per-pixel metric over the foreground and over the background; None for an empty part."""
+    """Return each per-pixel metric over the foreground and over the background; None for an empty part."""
     values: dict[str, float | None] = {}
     for metric in metrics:
         if isinstance(metric, LocalMetric):
@@ -186,7 +186,7 @@ def _compute_metric(metric: Metric, truth: Floats, estimate: Floats) -> float | 
     with wrap_plugin_errors(f"plugin {metric.name()}"):
         value = metric(truth, estimate)
         if value is not None and not np.isfinite(value):
-            raise ValueError(f"returned {value}; a metric returns None where its value is not finite")
+            raise ValueError(f"returned {value}; a metric must return None if its value is not finite")
         return None if value is None else float(value)
 
 

@@ -1,4 +1,4 @@
-"""Structure from motion: the model that a server builds of a scene from releases alone (the paper's supplement, Table S2).
+"""Structure from motion: a server's model of a scene, built from releases alone (the paper's supplement, Table S2).
 
 All images are privatised. Two keypoints match by a word that both images release and that is unique in each, by mutually
 nearest descriptors, or by mutually nearest subspaces. `bench/sfm/` verifies the pairs of images and builds the model.
@@ -32,15 +32,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Structure(Task):
-    """How much of a scene structure from motion reconstructs from releases of its queries.
+    """Size and accuracy of the model that structure from motion builds from releases of a scene's queries.
 
-    References, if there are any, are used for the dictionary alone.
+    References, if there are any, serve the dictionary alone.
     """
 
     judges_attacks: ClassVar[bool] = False
     needs_scene: ClassVar[bool] = True
 
-    images: int = 25  # the first queries of the scene, at most
+    images: int = 25  # largest number of queries, the first ones of the scene
     ratio: float = 0.8  # of Lowe's test among descriptors; 1 disables it
     mapper: Mapper = "global"
 
@@ -98,7 +98,7 @@ class Structure(Task):
 
     def _match(self, first: Release, second: Release) -> np.ndarray:
         try:
-            # No ratio test for subspaces: their nearest and second nearest are about equally far away.
+            # No ratio test for subspaces: the distances to the nearest and the second nearest are about equal.
             ratio = 1.0 if isinstance(first, Subspaces) else self.ratio
             return two_view_matching.match_releases(first, second, ratio, unique=True)
         except TypeError as error:
@@ -106,11 +106,11 @@ class Structure(Task):
 
 
 def compute_metrics(model: Model | None, truth: Sequence[pycolmap.Rigid3d | None]) -> dict[str, float | None]:
-    """Compute the paper's four measures, and the number of images with the right pose; None where poses are withheld.
+    """Return the paper's four measures, and the number of images with a correct pose, which is None if poses are withheld.
 
     Parameters
     ----------
-    model : None if there is none
+    model : None if no model was built
     truth : cam_from_world of every image
     """
     poses = [pose for pose in truth if pose is not None]

@@ -1,4 +1,4 @@
-"""The paper's tables and figures, beside the paper's own numbers: `bench reproduce`."""
+"""Reproduces the paper's tables and figures, next to the paper's own numbers: `bench reproduce`."""
 
 from leaderboard.reproduce.command import Reproduction, list_materials, reproduce
 

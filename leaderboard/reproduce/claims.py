@@ -1,9 +1,9 @@
 """Claims of the paper as statements about table entries, and whether our records confirm them.
 
-A claim is a list of statements. A table entry is the mean over samples, such as photographs, of a measure in a row. A statement
-says that a linear combination of entries lies in an open interval; "A > B" says so of A − B and (0, ∞). The verdict rests on the
-bootstrap interval of that combination, paired by sample. The statement holds if this interval lies inside and fails if it lies
-outside. Otherwise there is no verdict ("cannot tell").
+A claim is a list of statements. A table entry is the mean over samples, such as photographs, of a measure in a row. A
+statement says that a linear combination of entries lies in an open interval. For example, "A > B" says that A − B lies in (0,
+∞). The verdict depends on the bootstrap interval of that combination, paired by sample. The statement holds if this interval
+lies inside the open interval, and fails if it lies outside. Otherwise the verdict is "cannot tell".
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from leaderboard.intervals import Interval, combine_independent, interval
 
 TableEntry = tuple[str, str]  # a row's name, a measure
 
-# With fewer samples even a common sign is no evidence at 95%: with five, p = 2 · 2^-5.
+# With fewer samples, even equal signs of all differences are no evidence at 95%: five have p = 2 · 2^-5.
 MIN_SAMPLES = 6
 
 
 class Verdict(Enum):
-    """Whether a statement or a claim is confirmed by our records."""
+    """Whether our records confirm a statement or a claim."""
 
     HOLDS = "holds"
     FAILS = "does not hold"
@@ -40,12 +40,12 @@ class Statement:
     weights: Mapping[TableEntry, float]
     above: float = -math.inf
     below: float = math.inf
-    paired: bool = True  # its entries have the same samples; otherwise each entry is resampled by itself
+    paired: bool = True  # whether its entries have the same samples; otherwise each entry is resampled by itself
 
 
 @dataclass(frozen=True, kw_only=True)
 class Claim:
-    """A claim of the paper, and the statements that it implies about table entries."""
+    """A claim of the paper, and the statements about table entries that it implies."""
 
     text: str
     statements: tuple[Statement, ...]
@@ -53,13 +53,13 @@ class Claim:
 
 @dataclass(frozen=True, kw_only=True)
 class Evidence:
-    """A statement with the paper's value, ours over the samples that have all its entries, and the verdict."""
+    """A statement with the paper's value, our value over the samples that have all its entries, and the verdict."""
 
     statement: Statement
     paper: float | None
     ours: Interval | None  # None if no sample has all entries
     verdict: Verdict
-    reason: str = ""  # for `OPEN`, if not the interval
+    reason: str = ""  # for `OPEN`, if there is another reason than the interval
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,7 +102,7 @@ def falling(entries: Sequence[TableEntry]) -> tuple[Statement, ...]:
 
 
 def same_order(paper: Mapping[TableEntry, float], min_difference: float, measure: str) -> Claim:
-    """Return the claim that entries whose values differ by more than `min_difference` in the paper have the same order here."""
+    """Return the claim that all entries that differ by more than `min_difference` in the paper have the same order here."""
     pairs = [pair for pair in itertools.combinations(paper, 2) if abs(paper[pair[0]] - paper[pair[1]]) > min_difference]
     ordered = [sorted(pair, key=lambda entry: -paper[entry]) for pair in pairs]
     return Claim(
@@ -121,7 +121,7 @@ def judge_claims(
     ----------
     values : a column for each entry, a row for each sample; missing values are NaN
     paper : the printed value of each entry
-    reasons : row's name -> why it has no values, for rows without values
+    reasons : name of a row without values -> the reason
     """
     return tuple(
         ClaimResult(

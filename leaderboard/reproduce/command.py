@@ -18,6 +18,7 @@ from bench.runner import engines
 from bench.runner.engines import Engine
 from bench.settings import Asset
 from leaderboard import localization_results
+from leaderboard.provenance import format_provenance
 from leaderboard.reproduce import figures, page, run, tables
 from leaderboard.reproduce.drawing import Drawing, FigureData, save
 from leaderboard.reproduce.profiles import Materials, Setting, find_profile
@@ -49,10 +50,11 @@ def reproduce(
     out: Path | None,
     workers: int | None,
     materials: Mapping[str, str],
+    command: str,
 ) -> Reproduction:
     """Reproduce the table or figures `name` with the profile `profile_name`, and write the result.
 
-    Tables with the same `out` share their records.
+    Tables with the same `out` share their records. `command` is the command line, which the results name.
 
     Raises
     ------
@@ -86,13 +88,14 @@ def reproduce(
     folder = out or Path("runs") / f"reproduce-{profile.name}-{_name_folder(images, evaluation_set)}"
     engine = engines.choose_engine(workers or (threads.count_cores() if needs_dataset else 1))
     if table is None:
-        return _reproduce_figures(name, drawings[name], setting, evaluation_set, folder, engine)
+        return _reproduce_figures(name, drawings[name], setting, evaluation_set, folder, engine, command)
     reproduced = run.reproduce_table(table, setting, evaluation_set, folder, engine)
-    page.write(reproduced, folder)
+    records = run.list_records(reproduced.result)
+    provenance = format_provenance(command, records)
+    page.write(reproduced, folder, provenance)
     data = FigureData(setting=setting, evaluation_set=evaluation_set, result=reproduced.result, out=folder)
-    records = (record for group in reproduced.result.records.values() for record in group)
     files = [Text(line) for line in localization_results.write(records, folder)]
-    files += [] if table.draw is None else _save_figures(name, table.draw(data), folder)
+    files += [] if table.draw is None else _save_figures(name, table.draw(data), folder, provenance)
     return Reproduction(out=folder, output=(*page.to_terminal(reproduced), *files), failed=run.count_failures(reproduced.result))
 
 
@@ -116,20 +119,27 @@ def _name_folder(images: Path | None, evaluation_set: EvaluationSet) -> str:
 
 
 def _reproduce_figures(
-    name: str, drawings: tuple[Drawing, ...], setting: Setting, evaluation_set: EvaluationSet, out: Path, engine: Engine
+    name: str,
+    drawings: tuple[Drawing, ...],
+    setting: Setting,
+    evaluation_set: EvaluationSet,
+    out: Path,
+    engine: Engine,
+    command: str,
 ) -> Reproduction:
     """Run the rows of the figures, and draw them into `out`/figures."""
     rows = {row.name: row for drawing in drawings for row in drawing.build_rows(setting)}
     result = run.run_rows(list(rows.values()), setting, evaluation_set, out, name, engine)
     data = FigureData(setting=setting, evaluation_set=evaluation_set, result=result, out=out)
-    files = [file for drawing in drawings for file in _save_figures(drawing.name, drawing.draw(data), out)]
+    provenance = format_provenance(command, run.list_records(result))
+    files = [file for drawing in drawings for file in _save_figures(drawing.name, drawing.draw(data), out, provenance)]
     return Reproduction(out=out, output=tuple(files), failed=run.count_failures(result))
 
 
-def _save_figures(name: str, figures: Iterator[tuple[str, Figure]], out: Path) -> list[Text]:
+def _save_figures(name: str, figures: Iterator[tuple[str, Figure]], out: Path, provenance: str) -> list[Text]:
     """Save figures in `out`/figures and return the paths of their files."""
     stems = ((out / FIGURES / f"{name}-{kind}".removesuffix("-").replace("/", "-"), figure) for kind, figure in figures)
-    return [Text(str(file)) for stem, figure in stems for file in save(figure, stem)]
+    return [Text(str(file)) for stem, figure in stems for file in save(figure, stem, provenance)]
 
 
 def list_materials() -> tuple[str, ...]:

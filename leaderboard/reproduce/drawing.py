@@ -16,6 +16,7 @@ from bench.images import samples
 from bench.runner.directory import reconstruction_path
 from bench.types import Bytes
 from leaderboard.figures import Panel
+from leaderboard.provenance import CHUNK
 from leaderboard.reproduce.profiles import Setting
 from leaderboard.reproduce.run import EvaluationSet, RunResult, select_records
 from leaderboard.reproduce.study import Row
@@ -39,13 +40,13 @@ class FigureData:
     out: Path
 
     def load_originals(self) -> Iterator[tuple[str, Bytes]]:
-        """Yield the names of the readable samples, and their pixels."""
+        """Yield the name and the pixels of each readable sample."""
         for sample in self.evaluation_set.samples:
             with contextlib.suppress(SampleError):
                 yield sample.name, samples.read_pixels(sample.images[0])[0]
 
     def build_panel(self, row: str, sample: str, title: str = "", metrics: Mapping[str, str] = SSIM, digits: int = 3) -> Panel:
-        """Return the reconstruction of a sample in a row, with `metrics` (label -> metric) beneath, or the reason for none."""
+        """Return a panel with the reconstruction of a sample in a row. `metrics` (label -> metric) are in the caption."""
         for record in select_records(self.result, row):
             if record["status"] == "n/a":
                 return Panel(None, title, "n/a")
@@ -64,13 +65,13 @@ class Drawing:
     name: str
     draw: Callable[[FigureData], Iterator[tuple[str, Figure]]]  # yields suffixes of the name, and figures
     build_rows: Callable[[Setting], tuple[Row, ...]] = field(default=lambda setting: ())
-    uses_queries: bool = False  # of a dataset; the figure is then a target of its own
+    uses_queries: bool = False  # whether it shows queries of a dataset; the figure is then a target of its own
 
 
-def save(figure: Figure, path: Path) -> list[Path]:
-    """Write the figure in all formats and return their paths."""
+def save(figure: Figure, path: Path, provenance: str) -> list[Path]:
+    """Write the figure in all formats and return their paths. The PNG holds `provenance` as a text chunk."""
     path.parent.mkdir(parents=True, exist_ok=True)
     files = [path.with_name(f"{path.name}.{suffix}") for suffix in FORMATS]
     for file, metadata in zip(files, FORMATS.values(), strict=True):
-        figure.savefig(file, metadata=metadata)
+        figure.savefig(file, metadata=metadata | ({CHUNK: provenance} if file.suffix == ".png" else {}))
     return files

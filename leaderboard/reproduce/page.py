@@ -26,13 +26,13 @@ DIGITS = 4  # of the numbers in the evidence
 FULL_LIST_LIMIT = 12  # a claim with more statements lists only those that fail or stay open
 TERMINAL_LIMIT = 12  # statements per claim in a terminal
 INTERVALS = (
-    f"In brackets: {LEVEL:.0%}, by percentile bootstrap over photographs, queries or seeds, of fractions Wilson's; a verdict "
-    "rests on the bootstrap of the paired combination."
+    f"In brackets: {LEVEL:.0%} intervals, by percentile bootstrap over photographs, queries or seeds; Wilson's for fractions. A "
+    "verdict rests on the bootstrap of the paired combination."
 )
 
 
-def write(table: ReproducedTable, out: Path) -> list[Path]:
-    """Write NAME.md, NAME.csv, NAME-claims.csv and NAME.json into `out` and return their paths.
+def write(table: ReproducedTable, out: Path, provenance: str) -> list[Path]:
+    """Write NAME.md, NAME.csv, NAME-claims.csv and NAME.json into `out` and return their paths. The page ends with `provenance`.
 
     Raises
     ------
@@ -41,7 +41,7 @@ def write(table: ReproducedTable, out: Path) -> list[Path]:
     """
     name = table.definition.name
     texts = {
-        f"{name}.md": to_markdown(table),
+        f"{name}.md": f"{to_markdown(table)}\n{provenance}",
         f"{name}.csv": tables.write_csv(tabulate_values(table)),
         f"{name}-claims.csv": tables.write_csv(tabulate_statements(table)),
         f"{name}.json": json.dumps(to_json(table), indent=1, ensure_ascii=False, allow_nan=False) + "\n",
@@ -63,7 +63,7 @@ def format_heading(table: ReproducedTable) -> str:
 
 
 def to_markdown(table: ReproducedTable) -> str:
-    """Return the whole report."""
+    """Return the values and the claims."""
     values = replace(compare_values(table), heading="")
     lines = [
         f"# {format_heading(table)}",

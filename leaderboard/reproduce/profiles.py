@@ -1,4 +1,4 @@
-"""Profiles: the sizes of a reproduction; and the files that it uses."""
+"""Profiles, which are the sizes of a reproduction, and the files that it uses."""
 
 from __future__ import annotations
 
@@ -18,29 +18,29 @@ class Profile:
     """Sizes of a reproduction. The code is the same for all profiles."""
 
     name: str
-    photographs: int  # per table, at most
+    photographs: int  # maximum number per table
     builtin: tuple[str, ...] | None  # names of the built-in photographs to use; None: all
-    figure_photographs: int  # per figure, at most
-    scale: float  # of every |K| of a table that varies it; every ε is shifted by its logarithm
-    subspaces: int  # total of Table S3
-    other_releases: int  # of Table S4, at most
+    figure_photographs: int  # maximum number per figure
+    scale: float  # factor of each |K| of a table that varies it; its logarithm is added to each ε
+    subspaces: int  # total number for Table S3
+    other_releases: int  # maximum number for Table S4
     gallery: Gallery  # default dataset of the localization tables
-    gallery_scale: float  # as `scale`, for these tables
-    trials: float  # of RANSAC, as a fraction of the paper's
+    gallery_scale: float  # `scale` of these tables
+    trials: float  # RANSAC's trials, as a fraction of the paper's
     walk: Walk  # default dataset of the structure-from-motion table
-    walk_scale: float  # as `scale`, for that table
-    walk_keypoints: int  # per image, at most, for that table
-    seeds: int  # of that table
-    # Fields of attacks that are set to save time, for attacks that have them. Otherwise attacks keep their tuned defaults.
+    walk_scale: float  # `scale` of that table
+    walk_keypoints: int  # maximum number per image for that table
+    seeds: int  # number of seeds of that table
+    # Values of fields that save time, for attacks with these fields. All other fields have their tuned defaults.
     attack_overrides: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def figure_gallery(self) -> Gallery:
-        """The gallery with only the queries that figures show."""
+        """The gallery, with only the queries that figures show."""
         return dataclasses.replace(self.gallery, queries=self.figure_photographs, night=0.0)
 
 
-# Of the built-in photographs `rocket` has the fewest keypoints.
+# `rocket` is the built-in photograph with the fewest keypoints.
 SMOKE = Profile(
     name="smoke",
     photographs=2,
@@ -95,7 +95,7 @@ PROFILES = {profile.name: profile for profile in (SMOKE, CPU, PAPER)}
 
 @dataclass(frozen=True, kw_only=True)
 class Materials:
-    """Dictionaries, databases and networks: the shipped ones or a user's own."""
+    """Dictionaries, databases and networks: the shipped ones, or those of a user."""
 
     dictionary: Asset = Asset("shipped")  # K of LDP-Feat; a smaller |K| is its first words
     database: Asset = Asset("shipped")  # W of affine lifting
@@ -107,12 +107,12 @@ class Materials:
 
 @dataclass(frozen=True, kw_only=True)
 class Setting:
-    """Everything that the rows of a table depend on."""
+    """The settings that the rows of a table depend on."""
 
     profile: Profile
     materials: Materials
     extractor: Extractor
-    photographs: int  # their number
+    photographs: int  # number of photographs
     seed: int = 0
 
 

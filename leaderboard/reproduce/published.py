@@ -1,4 +1,4 @@
-"""What the paper prints (Pittaluga and Zhuang, ICCV 2023, with its supplement): its tables as CSV files."""
+"""The tables that the paper prints (Pittaluga and Zhuang, ICCV 2023, with its supplement), read from CSV files."""
 
 from __future__ import annotations
 
@@ -16,5 +16,5 @@ def read_rows(name: str) -> list[dict[str, str]]:
 
 
 def parse_numbers(row: Mapping[str, str], columns: Iterable[str]) -> dict[str, float]:
-    """Return those columns of a row as numbers."""
+    """Return these columns of a row as numbers."""
     return {column: float(row[column]) for column in columns}

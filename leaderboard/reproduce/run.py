@@ -182,9 +182,14 @@ def select_records(result: RunResult, row: str) -> tuple[Record, ...]:
     return tuple(record for key in result.experiment_ids[row] for record in result.records.get(key, ()))
 
 
+def list_records(result: RunResult) -> list[Record]:
+    """Return all records."""
+    return [record for group in result.records.values() for record in group]
+
+
 def count_failures(result: RunResult) -> int:
     """Return the number of failed records."""
-    return sum(record["status"] == "failed" for records in result.records.values() for record in records)
+    return sum(record["status"] == "failed" for record in list_records(result))
 
 
 def _get_value(measure: Measure, record: Record) -> float | None:

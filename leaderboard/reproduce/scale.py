@@ -1,7 +1,8 @@
-"""Smaller dictionaries at the same probability of the true word: every |K| is multiplied by s, every ε is increased by ln s.
+"""Smaller dictionaries at the same probability of the true word: each |K| is multiplied by s, and ln s is added to each ε.
 
-The probability that the true word is in its set is m e^ε / (m e^ε + |K| − m). Apart from the − m it depends on |K| and ε through
-|K| e^-ε alone, which s |K| and ε + ln s leave unchanged. The guarantee changes: the smaller table has a smaller ε.
+The probability that the true word is in its set is m e^ε / (m e^ε + |K| − m). Apart from the term − m, it depends on |K| and
+ε through |K| e^-ε alone. s |K| and ε + ln s have the same value of it. The guarantee changes, since the smaller table has a
+smaller ε.
 """
 
 from __future__ import annotations
@@ -10,10 +11,10 @@ import math
 
 
 def words(paper: int, factor: float) -> int:
-    """Return our |K| for the paper's."""
+    """Return our |K| for the paper's |K|."""
     return round(paper * factor)
 
 
 def epsilon(paper: float, factor: float) -> float:
-    """Return our ε for the paper's."""
+    """Return our ε for the paper's ε."""
     return paper + math.log(factor)

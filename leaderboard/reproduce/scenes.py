@@ -1,7 +1,7 @@
 """Rows and measures of the localization tables: queries under LDP-Feat, over |K|, ε, m and the matcher.
 
-Where every |K| is scaled by s, every ε is shifted by ln s (`scale.py`); RANSAC's trials are scaled as well. The row without a
-dictionary and without privacy uses raw descriptors; the one with privacy is naive LDP over all descriptors.
+Each |K| is scaled by s and ln s is added to each ε (`scale.py`). RANSAC's trials are scaled as well. With |K| = 2^1024, the row
+without privacy (ε = ∞) uses raw descriptors, and the row with privacy uses naive LDP on all descriptors.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from leaderboard.reproduce.profiles import Profile, Setting
 from leaderboard.reproduce.study import Measure, Row, build_plugin
 
 ALL_DESCRIPTORS = "2^1024"  # |K| of all descriptors
-TRIALS = 10_000_000  # of RANSAC, in the paper
+TRIALS = 10_000_000  # RANSAC's trials in the paper
 THRESHOLDS = ("0.25m_2deg", "0.5m_5deg", "5m_10deg")
 MIN_DIFFERENCE = 10.0  # points of recall
 
@@ -37,7 +37,7 @@ def select_gallery(profile: Profile) -> Dataset:
 
 
 def build_task(setting: Setting, trials: int = TRIALS, **configuration: Any) -> Task:
-    """Return the localization task; `trials` are the paper's, which the profile scales."""
+    """Return the localization task. `trials` is the number in the paper, which the profile scales."""
     return build_plugin(
         discovery.TASK, "localization", {"trials": max(1, round(trials * setting.profile.trials)), **configuration}
     )
@@ -46,7 +46,7 @@ def build_task(setting: Setting, trials: int = TRIALS, **configuration: Any) -> 
 def build_defense(
     setting: Setting, size: str, epsilon: str, subset: int, dictionary: str = REFERENCES, factor: float | None = None
 ) -> Defense:
-    """Return the defense for the paper's |K|, ε and m. |K| is scaled by `factor`; None: the profile's for the gallery."""
+    """Return the defense for the paper's |K|, ε and m. |K| is scaled by `factor`, by default the profile's `gallery_scale`."""
     if size == ALL_DESCRIPTORS:
         if math.isinf(float(epsilon)):
             return build_plugin(discovery.DEFENSE, "none", {})
@@ -58,7 +58,7 @@ def build_defense(
 
 
 def build_labels(setting: Setting, size: str, epsilon: str, subset: int, factor: float | None = None) -> dict[str, str]:
-    """Return the labels of a row: the paper's |K|, ε and m, and ours."""
+    """Return the labels of a row: the paper's |K|, ε and m, then our |K| and ε."""
     if size == ALL_DESCRIPTORS:
         ours = {"our |K|": "all", "our ε": epsilon}
     else:
@@ -68,7 +68,7 @@ def build_labels(setting: Setting, size: str, epsilon: str, subset: int, factor:
 
 
 def scale_parameters(setting: Setting, size: str, epsilon: str, factor: float | None = None) -> tuple[int, float]:
-    """Return our |K| and ε for the paper's."""
+    """Return our |K| and ε for the paper's |K| and ε."""
     scaling = setting.profile.gallery_scale if factor is None else factor
     return scale.words(int(size), scaling), scale.epsilon(float(epsilon), scaling)
 
@@ -93,7 +93,7 @@ def build_row(setting: Setting, line: Mapping[str, str], paper: Mapping[str, flo
 
 
 def build_recall_measures(**conditions: str | None) -> dict[str, Measure]:
-    """Return the recall at each threshold, by prefix and condition: `recall="day"` gives `recall_0.25m_2deg` of day queries."""
+    """Return measures of the recall at each threshold: `recall="day"` gives `recall_0.25m_2deg` and others of the day queries."""
     return {
         f"{prefix}_{threshold}": Measure(metric=f"recall_{threshold}", factor=100, digits=1, condition=condition, fraction=True)
         for prefix, condition in conditions.items()
@@ -102,7 +102,7 @@ def build_recall_measures(**conditions: str | None) -> dict[str, Measure]:
 
 
 def build_error_measures(condition: str | None = None) -> dict[str, Measure]:
-    """Return the median errors, in the scene's unit of length and degrees, and RANSAC's counts, means over queries."""
+    """Return measures of the median errors, in the scene's unit of length and degrees, and of the mean counts of RANSAC."""
     errors = {
         f"median_{name}": Measure(metric=name, digits=2, condition=condition, median=True)
         for name in ("translation_error", "rotation_error")

@@ -1,4 +1,4 @@
-"""Definition of a reproduced table: rows, each with our matching experiment, and the claims about them."""
+"""Definition of a reproduced table: its rows, each with our corresponding experiment, and the claims about them."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ P = TypeVar("P", bound=Plugin)
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """A row of a table of the paper, and our defense, attack and task for it."""
+    """A row of a table of the paper, with our defense, attack and task for it."""
 
-    name: str  # claims refer to it
+    name: str  # the name by which claims refer to the row
     labels: Mapping[str, str]  # column -> text
     paper: Mapping[str, float]  # measure -> the paper's value
     defense: Defense
@@ -43,9 +43,9 @@ class Measure:
     metric: str
     factor: float = 1.0  # from our unit of measurement to the paper's
     digits: int = 3  # after the decimal point
-    condition: str | None = None  # of the samples that count; None: all
+    condition: str | None = None  # only samples with this condition count; None: all
     fraction: bool = False  # each sample's value is 0 or 1, and the mean is a fraction
-    median: bool = False  # over samples, instead of the mean; a sample without a value counts as the worst
+    median: bool = False  # median over samples instead of the mean; a sample without a value counts as the worst
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,11 +59,11 @@ class Table:
     build_claims: Callable[[Mapping[TableEntry, float]], tuple[Claim, ...]]  # from the paper's values of all entries
     dataset: Callable[[Profile], Dataset] | None = None  # the default; None: the table uses photographs
     extractor: Callable[[Profile], Extractor] = lambda profile: Sift()  # the default
-    multiple_seeds: bool = False  # as many as the profile says; otherwise one
+    multiple_seeds: bool = False  # as many seeds as the profile has; otherwise one
     rank_measure: str | None = None  # the measure whose rank correlation with the paper's is reported
     # Rows of other tables that claims compare with.
     build_reference_rows: Callable[[Setting], tuple[Row, ...]] = field(default=lambda setting: ())
-    draw: Callable[[FigureData], Iterator[tuple[str, Figure]]] | None = None  # its figures, as of a `Drawing`
+    draw: Callable[[FigureData], Iterator[tuple[str, Figure]]] | None = None  # yields its figures, as `Drawing.draw` does
     notes: tuple[str, ...] = ()
 
 
@@ -79,7 +79,7 @@ def build_reconstruction(setting: Setting) -> Reconstruction:
 
 
 def build_plugin(kind: Kind[P], name: str, configuration: Mapping[str, Any], optional: Mapping[str, Any] | None = None) -> P:
-    """Return the plugin `name` with the fields of `configuration`, and those of `optional` that it has."""
+    """Return the plugin `name` with the fields of `configuration`, and with those fields of `optional` that it has."""
     plugin = discovery.load_plugin(kind, name)
     types = fields.resolve_types(plugin)
     return spec.build(plugin, {**configuration, **{field: value for field, value in (optional or {}).items() if field in types}})

@@ -1,4 +1,4 @@
-"""The paper's tables as suites, for `bench sweep`."""
+"""Builds suites for `bench sweep` from the paper's tables."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from leaderboard.reproduce.profiles import CPU, Materials, Setting
 def build_suite(name: str) -> Suite:
     """Return the suite of a table's rows and reference rows, with the shipped files and the profile `cpu`.
 
-    `bench reproduce` reuses its records if `--out` names the same folder.
+    `bench reproduce` reuses the records of the suite if `--out` names the same folder.
     """
     table = tables.load_tables()[name]
     extractor = table.extractor(CPU)

@@ -10,6 +10,7 @@ from statistics import median
 from typing import Any
 
 from bench.mechanisms.composition import DELTA
+from bench.runner.records import Record
 from leaderboard.comparison import ComparisonGroup, GroupedExperiment
 from leaderboard.group_tables import GroupColumn, GroupRow, GroupTable, Value, comparable_number, describe_guarantee
 from leaderboard.intervals import Interval
@@ -54,6 +55,10 @@ class View:
     def experiment(self) -> GroupedExperiment:
         return self.row.experiment
 
+    def find_picture(self, sample: str) -> Picture | None:
+        """Return the picture of a sample, or None."""
+        return next((picture for picture in self.pictures if picture.sample == sample), None)
+
 
 def select_columns(table: GroupTable) -> list[GroupColumn]:
     """Return the columns of the page's table: the judged measures, and what identifies a row."""
@@ -86,6 +91,11 @@ def build_view(
     )
 
 
+def label_sample(group: ComparisonGroup, record: Record) -> str:
+    """Return the name of a record's sample, with its seed where the group has several."""
+    return record["sample"] if len(group.seeds) == 1 else f"{record['sample']}, seed {record['seed']}"
+
+
 def _split_interval(text: str, value: Value) -> tuple[str, str]:
     """Return the number, and its interval if it has one."""
     if not isinstance(value, Interval):
@@ -103,8 +113,9 @@ def _sort_key(value: Value) -> str:
 def _list_pictures(group: ComparisonGroup, experiment: GroupedExperiment, out: Path) -> Iterator[Picture]:
     for record, files in pictures.write_pairs(experiment.records, out):
         score = record["metrics"].get(PRIVACY)
-        sample = record["sample"] if len(group.seeds) == 1 else f"{record['sample']}, seed {record['seed']}"
-        yield Picture(sample=sample, score="" if score is None else f"SSIM {format_number(score)}", files=files)
+        yield Picture(
+            sample=label_sample(group, record), score="" if score is None else f"SSIM {format_number(score)}", files=files
+        )
 
 
 def _list_budget(experiment: GroupedExperiment) -> Iterator[tuple[str, str]]:

@@ -19,16 +19,19 @@ from bench.core.progress import Progress
 from bench.core.table import Table, to_csv, to_latex, to_markdown
 from leaderboard import group_tables, plots, recipe
 from leaderboard.comparison import ComparisonGroup, build_groups, load_records
+from leaderboard.provenance import format_provenance
 from leaderboard.recipe import Lookup
 from leaderboard.reproduce.drawing import save
 from leaderboard.site import experiments
 from leaderboard.site.chart import build_charts
+from leaderboard.site.overview import build_overview
 from leaderboard.tradeoff import build_tradeoffs
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PAGE = "index.html"
+COMMAND = "bench leaderboard --results RESULTS --out SITE"  # in the plots' provenance, without the paths of a machine
 WRITERS: dict[str, Callable[[Table], str]] = {"md": to_markdown, "csv": to_csv, "tex": to_latex}
 
 
@@ -80,14 +83,16 @@ def _write_group(
         views.append(experiments.build_view(group, table, row, tradeoffs, out, lookup))
         progress.advance(note=group.title)
     figures = plots.draw_plots(group, tradeoffs) if group.has_attacks else ()
+    provenance = format_provenance(COMMAND, [experiment.metadata for experiment in group.experiments])
     return {
         "group": group,
         "table": table,
         "columns": experiments.select_columns(table),
         "experiments": views,
+        "overview": build_overview(group, views),
         "charts": build_charts(tradeoffs),
         "tables": [_write_tables(table, f"{name}-{kind}", out) for kind, table in tables.items()],
-        "plots": [_write_plot(name, kind, figure, out) for kind, figure in figures],
+        "plots": [_write_plot(f"{name}-{_slugify(kind)}", kind, figure, provenance, out) for kind, figure in figures],
     }
 
 
@@ -99,10 +104,9 @@ def _write_tables(table: Table, name: str, out: Path) -> dict[str, str]:
     return {suffix: f"tables/{name}.{suffix}" for suffix in WRITERS}
 
 
-def _write_plot(name: str, kind: str, figure: Figure, out: Path) -> dict[str, Any]:
-    files = {
-        path.suffix[1:]: path.relative_to(out).as_posix() for path in save(figure, out / "plots" / f"{name}-{_slugify(kind)}")
-    }
+def _write_plot(name: str, kind: str, figure: Figure, provenance: str, out: Path) -> dict[str, Any]:
+    paths = save(figure, out / "plots" / name, provenance)
+    files = {path.suffix[1:]: path.relative_to(out).as_posix() for path in paths}
     return files | {"name": kind.replace("-", ", "), "interactive": kind.startswith(plots.TRADEOFF)}
 
 

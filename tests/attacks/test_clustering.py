@@ -1,4 +1,4 @@
-"""Clustering and intersection with known answers: few words, and other releases that do or do not share them."""
+"""The clustering and the intersection attack with known answers: few words, and other releases with or without them."""
 
 import dataclasses
 
@@ -59,7 +59,7 @@ def test_clustering_finds_the_descriptor_with_releases_that_share_the_words(priv
 
 @pytest.mark.slow
 def test_clustering_is_at_chance_if_no_release_shares_a_word(private, public_words, tmp_path):
-    """Negative control: each descriptor alone, so that its photograph has no other subspaces, and releases of another W."""
+    """Negative control: photographs with a single descriptor have no other subspaces, and other releases use another W."""
     attack = Clustering(database=public_words, neighbours=9, coverage=1.0)
     others = release_others(write_dictionary(tmp_path, 400, seed=7))
     alone = [attack_succeeds(attack, private, others, SECRET.take(np.array([row])), row)[0] for row in range(len(SECRET))]

@@ -1,4 +1,4 @@
-"""The context attack: its arithmetic and its training against enumeration in toy worlds of known co-occurrence."""
+"""The context attack: arithmetic and training against enumeration, for synthetic words of known co-occurrence."""
 
 import dataclasses
 import itertools
@@ -146,7 +146,7 @@ def test_training_learns_the_enumerated_posterior(trained):
 
 @pytest.mark.slow
 def test_without_context_it_is_at_chance(trained):
-    """Control: the same sets at other keypoints."""
+    """Negative control: the same sets at other keypoints."""
     true, sets = draw_chains(400, np.random.default_rng(1))
     order = np.random.default_rng(2).permutation(true.size)
     example = build_world(true.ravel()[order].reshape(true.shape), sets.reshape(-1, SIZE)[order].reshape(sets.shape))

@@ -56,7 +56,7 @@ def recover(attack: Database, case: Case, words: np.ndarray) -> np.ndarray:
 
 
 def draw_sparse(rng: np.random.Generator, count: int) -> np.ndarray:
-    """Draw rows like SIFT's: few large components, many near zero."""
+    """Draw rows similar to SIFT's: few large components, and many near zero."""
     return np.minimum(rng.gamma(0.6, 40.0, (count, 128)) + 1, 255).astype(np.uint8)
 
 
@@ -222,7 +222,7 @@ def test_no_keypoints(rng):
 def test_it_does_not_apply_to_liftings_without_words():
     reason = Database().explain_not_applicable(Affine(lifting="random"), Sift(), Public())
     assert reason is not None
-    assert "no word" in reason
+    assert "no database words" in reason
     assert Database().explain_not_applicable(Affine(), Sift(), Public()) is None
 
 

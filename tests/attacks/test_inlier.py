@@ -1,4 +1,4 @@
-"""The inlier attack reads the release and the server's map, and nothing of the secret."""
+"""The inlier attack reads the release and the server's map, and not the secret."""
 
 import math
 from pathlib import Path
@@ -49,7 +49,7 @@ def test_the_secret_is_not_read(scene_index: SceneIndex, query: Sample, defense:
 
 
 @pytest.mark.slow
-def test_an_attack_that_reads_the_secret_is_noticed(scene_index: SceneIndex, query: Sample) -> None:
+def test_an_attack_that_reads_the_secret_is_detected(scene_index: SceneIndex, query: Sample) -> None:
     """Negative control."""
     secret = scene_index.extractor.extract(query.images[0].read())
 

@@ -46,7 +46,7 @@ def secret() -> Features:
 
 
 def build_trial(attack: Attack, defense: Affine | LDP, secret: Features, others: int | None = None) -> Trial:
-    """Build a trial of an attack on one release; `others` limits how many releases of other photographs there are."""
+    """Build a trial of an attack on one release. `others` limits the number of releases of other photographs."""
     public = Public()
     pool = ReleasePool(photographs.list_builtin()[1:4], Sift(max_keypoints=400), defense, public, derive_generator)
 
@@ -150,7 +150,7 @@ def test_less_knowledge_does_not_help(plugin, database, secret):
 
 @pytest.mark.slow
 def test_a_gain_by_less_knowledge_would_be_detected(database, secret):
-    """Negative control: with the two exchanged, the interval does not contain zero."""
+    """Negative control: with exchanged sides, the interval does not contain zero."""
     with_all, with_less = compare_knowledge(
         spec.read("database", discovery.ATTACK), secret, Affine(dim=4, database=database, sub_databases=SUB_DATABASES)
     )

@@ -45,7 +45,7 @@ def test_returns_words_of_the_public_database(release, words, tmp_path, rng):
 
 
 def test_in_the_defenses_own_database_it_finds_an_adversary(rng, tmp_path):
-    """The reason for Z: in W the nearest word is an adversarial one, at distance zero."""
+    """In W the nearest word is an adversarial one at distance zero, so the attack needs Z."""
     private = tmp_path / "W.safetensors"
     words = dictionary.save(private, rng.integers(0, 200, (640, 128), dtype=np.uint8), {"photographs": []}).words
     codes = rng.integers(0, 200, (40, 128), dtype=np.uint8)

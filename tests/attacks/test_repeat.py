@@ -58,8 +58,8 @@ def test_liftings_intersect_in_the_descriptor(affine, dim, count):
     assert measure_errors(recover(affine(dim), release_repeatedly(affine(dim), count))).max() < 1e-5
 
 
-def test_liftings_of_another_descriptor_do_not(affine):
-    """Control."""
+def test_liftings_of_another_descriptor_do_not_intersect(affine):
+    """Negative control."""
     mixed = [*release_repeatedly(affine(4), 1), *release_repeatedly(affine(4), 1, OTHER, seed=1)]
     assert measure_errors(recover(affine(4), mixed)).min() > 0.1
 
@@ -103,7 +103,7 @@ def test_neither_basis_nor_order_matters(affine, rng):
 
 
 def test_liftings_that_share_a_word_intersect_in_a_line(rng):
-    """Through the descriptor and the word: its point nearest to zero is halfway between the two."""
+    """The line contains the descriptor and the word. Its point nearest to zero is halfway between the two."""
     d, shared, *others = unit_rows(draw_features(4).codes).astype(float)
     origin = d[None].astype(np.float32)
 
@@ -144,7 +144,7 @@ def test_success_agrees_with_enumeration(epsilon, domain, size, releases):
 
 
 def measure_success(true: np.ndarray, others: np.ndarray, domain: int, releases: int, rng: np.random.Generator) -> float:
-    """Return the fraction of true words found if the first set is theirs and the further ones are of `others`."""
+    """Return the fraction of true words that are found if the first set is theirs and the further sets are of `others`."""
     sets = [draw_word_subsets(true if number == 0 else others, domain, 2.0, 2, rng) for number in range(releases)]
     words = np.concatenate(sets, axis=1)
     return float((words[np.arange(len(words)), select_likeliest(words, rng)] == true).mean())

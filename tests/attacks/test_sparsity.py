@@ -65,7 +65,7 @@ def test_finds_every_degenerate_vertex_of_planes(rng):
 
 
 def solve_linear_programs(origin: np.ndarray, basis: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
-    """Reweighted L1 from 20 random starts: the first degenerate vertex of norm 1 that HiGHS finds."""
+    """Return the first degenerate vertex of norm 1 that HiGHS finds, by reweighted L1 from 20 random initial weights."""
     for _ in range(20):
         weights = rng.random(len(origin))
         for _ in range(5):
@@ -177,7 +177,7 @@ def test_control_noise_in_the_descriptor_hides_its_zeros(tmp_path: Path, rng):
 
 
 def test_with_a_database_of_raw_descriptors_the_attack_guesses(tmp_path: Path, rng):
-    """Every word is as sparse as the secret: at dim 2 a guess of two."""
+    """Every word is as sparse as the secret, so at dim 2 the attack guesses one of two."""
     secret, others = extract_sift(150), extract_sift(500, photograph=1)
     assert others.codes is not None
     words = np.unique(others.codes, axis=0)
@@ -199,6 +199,6 @@ def test_applies_to_extractors_that_declare_zeros():
     )
 
 
-def test_refuses_no_pivots():
+def test_zero_pivots_are_refused():
     with pytest.raises(UserError, match="at least 1"):
         Sparsity(pivots=0)

@@ -1,4 +1,4 @@
-"""The audit: sound defenses pass at any ε; each wrong one is detected by the family of events that it violates.
+"""The audit: sound defenses pass at any ε, and each wrong defense is detected by the family of events that it violates.
 
 Verdicts are at a confidence of 1 − 1e-6, and all seeds are fixed.
 """
@@ -37,7 +37,7 @@ def run_audit(defense: Defense, folder: Path, words: int | None = 64, trials: in
 
 
 def list_violations(found: Audit) -> set[str]:
-    """The families with a certain violation."""
+    """Return the families with a certain violation."""
     return {finding.family for finding in found.findings if finding.certain_epsilon > found.claimed}
 
 
@@ -112,7 +112,7 @@ def test_a_bound_near_the_claim_is_called_tight(tmp_path: Path) -> None:
 
 @pytest.mark.exhaustive
 def test_no_false_alarm(tmp_path: Path) -> None:
-    """Over many seeds, the bound of 95% fails sometimes, the verdict never."""
+    """Over many seeds, the 95% bound fails sometimes and the verdict never."""
     audits = [run_audit(LDP(epsilon=1.0), tmp_path, words=16, trials=1000, seed=seed) for seed in range(10)]
     assert "violated" not in {found.verdict for found in audits}
     bounds = [finding.epsilon for found in audits for finding in found.findings[:2]]
@@ -171,7 +171,7 @@ def test_memoized_answers_count_once_per_call(tmp_path: Path) -> None:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Secretive(LDP):
-    """A memoized defense with the claim of one that is not."""
+    """A memoized defense with the claim of a defense that is not memoized."""
 
     def is_memoized(self) -> bool:
         return False
@@ -206,7 +206,7 @@ class Wrong(LDP):
 
 
 class TooSmallDomain(Wrong):
-    """p from half of the words."""
+    """Computes p from half of the words."""
 
     def draw(self, true: Indices, domain: int, rng: np.random.Generator) -> Indices:
         included = rng.random(len(true)) < 1 / (1 + (domain / 2 - self.subset_size) / self.subset_size * math.exp(-self.epsilon))
@@ -214,7 +214,7 @@ class TooSmallDomain(Wrong):
 
 
 class OneTooFew(Wrong):
-    """p from one word less: too small a difference for any number of trials."""
+    """Computes p from one word less, a difference that no feasible number of trials detects."""
 
     def draw(self, true: Indices, domain: int, rng: np.random.Generator) -> Indices:
         included = rng.random(len(true)) < 1 / (1 + (domain - 1 - self.subset_size) / self.subset_size * math.exp(-self.epsilon))
@@ -222,7 +222,7 @@ class OneTooFew(Wrong):
 
 
 class TrueWordFirst(Wrong):
-    """The right sets, in an order that reveals the true word."""
+    """Releases the right sets, in an order that reveals the true word."""
 
     def draw(self, true: Indices, domain: int, rng: np.random.Generator) -> Indices:
         words = super().draw(true, domain, rng)
@@ -259,7 +259,7 @@ class SubsetSelectionAsItComes(Wrong):
 
 
 class SubsetSelectionSorted(SubsetSelectionAsItComes):
-    """The control: the same sets, sorted."""
+    """Negative control: the same sets, sorted."""
 
     def draw(self, true: Indices, domain: int, rng: np.random.Generator) -> Indices:
         return np.sort(super().draw(true, domain, rng), axis=1)
@@ -301,7 +301,7 @@ def test_a_wrong_defense_is_detected(wrong: type[Wrong], family: str, tmp_path: 
 
 @pytest.mark.slow
 def test_the_wrong_defenses_have_one_error(tmp_path: Path) -> None:
-    """The controls: with the draws of ldp, and with sorted sets, the same code passes."""
+    """Negative controls: with the draws of `ldp`, and with sorted sets, the same code passes."""
     assert run_audit(Wrong(epsilon=2.0), tmp_path).verdict != "violated"
     assert run_audit(SubsetSelectionSorted(epsilon=2.0), tmp_path, trials=2000).verdict != "violated"
 
@@ -368,13 +368,13 @@ def test_inputs_are_near_words_and_not_on_them(tmp_path: Path) -> None:
     ("defense", "words", "trials", "complaint"),
     [
         (LDP(epsilon=math.inf), 8, 100, "ldp, as configured, claims no epsilon"),
-        (LDP(), 1, 100, "--words: a dictionary has at least 2 words, not 1"),
+        (LDP(), 1, 100, "--words: must be at least 2, got 1"),
         (LDP(), 8, 3, "at least 4 trials, got 3"),
         (NaiveLDP(), 8, 100, "--words: naive-ldp has no dictionary"),
         (LDP(subset_size=9), 8, 100, "subset_size is 9, but the dictionary has 8 words"),
     ],
 )
-def test_mistakes(defense: Defense, words: int, trials: int, complaint: str, tmp_path: Path) -> None:
+def test_invalid_arguments_are_refused(defense: Defense, words: int, trials: int, complaint: str, tmp_path: Path) -> None:
     with pytest.raises(UserError, match=complaint):
         audit(defense, words, trials, 0, tmp_path)
 
@@ -392,7 +392,7 @@ def test_the_command(capfd: pytest.CaptureFixture[str]) -> None:
     assert "all outputs enumerated" in shown
     assert f"with confidence {CONFIDENCE:.0%}" in shown
     status, _, message = run(capfd, "--defense", "affine")
-    assert (status, message) == (2, "bench: affine, as configured, claims no epsilon: there is nothing to audit\n")
+    assert (status, message) == (2, "bench: affine, as configured, claims no epsilon, so there is nothing to audit\n")
 
 
 def test_a_violation_is_exit_status_1(capfd: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""Laws from all sequences of draws, against known laws."""
+"""Distributions from the enumeration of all sequences of draws, against known distributions."""
 
 import itertools
 import math
@@ -41,7 +41,7 @@ def test_draws_from_several_ranges() -> None:
 
 
 def test_doubles_are_exact() -> None:
-    """0.3 is no multiple of 2^-53, and rng.random() < 0.3 has a probability that is."""
+    """0.3 is not a multiple of 2^-53, but the probability of rng.random() < 0.3 is such a multiple."""
     found = compute_law(lambda rng: bool(rng.random() < 0.3))
     assert found.left_open == 0
     assert found.chances[True] == Fraction(math.ceil(Fraction(0.3) * 2**53), 2**53)
@@ -63,7 +63,7 @@ def test_several_thresholds_and_further_draws() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("domain", "size", "epsilon"), [(4, 2, 2.0), (3, 1, 1.0), (4, 3, 0.5), (4, 2, 0.0)])
 def test_the_sampler_has_the_law_of_the_theorem(domain: int, size: int, epsilon: float) -> None:
-    """Both kinds of draws, to within 2^-58, like the digits of p."""
+    """Both kinds of draws agree to within 2^-58, the precision of p."""
     p = Fraction(chance_digits(epsilon, domain, size, 128), 2**128)
     for true in range(domain):
         found = compute_law(

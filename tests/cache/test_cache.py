@@ -93,7 +93,7 @@ def bench(capfd: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, s
 
 @contextmanager
 def small_disk(size: int) -> Iterator[None]:
-    """Limit the size of files, as a full disk does."""
+    """Limit the size of files, to simulate a full disk."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
     try:
@@ -208,7 +208,7 @@ def test_words_are_searched_once_for_all_settings(images: Path, small: Asset, mo
     assert list(map(without_seconds, first)) == list(map(without_seconds, again))
 
 
-def test_protecting_for_real_stores_nothing(images: Path, small: Asset) -> None:
+def test_protect_stores_nothing(images: Path, small: Asset) -> None:
     from bench.images import photographs
     from bench.mechanisms.protection import protect
 
@@ -425,7 +425,7 @@ def test_use_updates_the_time_of_an_entry(three: dict[str, Path], capfd: pytest.
     [
         ((), "bench cache list|verify|prune"),
         (("pruen",), "did you mean 'cache prune'"),
-        (("prune",), "give what to remove"),
+        (("prune",), "select the entries"),
         (("prune", "--kind", "c"), "unknown kind 'c'"),
         (("prune", "--larger-than", "much"), "expected a size such as 20MB, not 'much'"),
     ],
@@ -458,5 +458,5 @@ def test_unfinished_entries_are_found(cache_folder: Path, capfd: pytest.CaptureF
     (cache_folder / "a" / "x.safetensors.123.unfinished").write_bytes(b"half")
     status, shown, _ = bench(capfd, "cache", "verify")
     assert status == 1
-    assert "never finished" in shown
+    assert "incomplete" in shown
     assert "freed 4 B" in bench(capfd, "cache", "prune", "--damaged")[1]

@@ -174,7 +174,7 @@ def test_interrupt_keeps_the_records(bench: Bench, images: Path, monkeypatch: py
     monkeypatch.setattr(Sketch, "reconstruct", interrupt)
     status, _, err = bench(*RUN, "--images", images, "--out", "x")
     assert status == 130
-    assert "run the same command again to go on" in err
+    assert "run the same command again to continue" in err
     assert len(Path("x/records.jsonl").read_text().splitlines()) == 1
     assert bench(*RUN, "--images", images, "--out", "x")[0] == 0
     assert len(views) == 3  # the first photograph is not computed again
@@ -361,5 +361,5 @@ def test_leaderboard_needs_a_folder_and_undamaged_records(bench: Bench, images: 
         file.write("damaged\n")
     status, _, err = bench("leaderboard", "--results", "runs", "--out", "x")
     assert status == 2
-    assert "line 3: no JSON" in err
+    assert "line 3: not valid JSON" in err
     assert not Path("x").exists()

@@ -15,7 +15,7 @@ from bench.images import photographs
 
 @pytest.fixture(scope="module")
 def album(tmp_path_factory):
-    """A folder with three of the dictionary_file-in photographs."""
+    """A folder with three of the built-in photographs."""
     folder = tmp_path_factory.mktemp("album")
     for source in photographs.list_builtin()[:3]:
         (folder / source.path.name).write_bytes(source.path.read_bytes())

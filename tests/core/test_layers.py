@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+pytest.importorskip("importlinter", reason="the extra `lint` is not installed")
+
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("bench", "attacks", "defenses", "metrics", "leaderboard", "suites")
 CODE = "import sys; from importlinter.cli import lint_imports_command; sys.exit(lint_imports_command())"

@@ -39,7 +39,7 @@ def photographs(truth: list[SceneImage], tmp_path_factory: pytest.TempPathFactor
 
 @pytest.fixture(scope="module")
 def dataset(photographs: Path, truth: list[SceneImage], tmp_path_factory: pytest.TempPathFactory) -> Captured:
-    """The unit of length is the metre, since the distance of two cameras is known in metres."""
+    """A dataset in metres, since the distance of two cameras is given in metres."""
     length = float(np.linalg.norm(centres(truth)[0] - centres(truth)[-1]))
     return Captured(
         path=photographs,
@@ -55,7 +55,7 @@ def centres(images: list[SceneImage]) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_structure_from_motion_recovers_the_gallery_s_cameras(dataset: Captured, truth: list[SceneImage]) -> None:
+def test_structure_from_motion_recovers_the_cameras_of_the_gallery(dataset: Captured, truth: list[SceneImage]) -> None:
     scene = dataset.scene()
     assert scene.excluded_images == ()
     assert [query.name for query in scene.queries] == ["0.png", "4.png", "8.png"]
@@ -105,7 +105,7 @@ def test_model_is_cached_by_content(
 
 
 def test_unit_must_be_fixed_by_two_photographs_with_poses(dataset: Captured) -> None:
-    with pytest.raises(UserError, match=r"99\.png, which fixes the unit of length, has no pose; name another"):
+    with pytest.raises(UserError, match=r"99\.png, which defines the unit of length, has no pose; give another"):
         replace(dataset, second="99.png").scene()
     with pytest.raises(UserError, match=r"0\.png and 0\.png have the same position"):
         replace(dataset, second="0.png").scene()

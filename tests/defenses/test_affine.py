@@ -45,7 +45,7 @@ def make_features(count: int, seed: int = 0) -> Features:
 
 
 def distances(points: np.ndarray, origins: np.ndarray, bases: np.ndarray) -> np.ndarray:
-    """From point k to subspace n, in float64. (K, D), (N, D), (N, dim, D) -> (N, K)"""
+    """Return the distance of each point to each subspace, in float64. (K, D), (N, D), (N, dim, D) -> (N, K)"""
     away = points.astype(float)[None] - origins.astype(float)[:, None]  # (N, K, D)
     along = np.einsum("nkd,nid->nki", away, bases.astype(float))
     return np.linalg.norm(away - np.einsum("nki,nid->nkd", along, bases.astype(float)), axis=2)
@@ -109,7 +109,7 @@ Reparameterise = Callable[[np.ndarray, np.ndarray, np.random.Generator], Paramet
 
 
 def lift_examples(count: int = 200, dim: int = 4, adversarial: int = 2) -> Parameters:
-    """Descriptors (N, D) and orthonormal directions (N, dim, D)."""
+    """Return descriptors (N, D) and orthonormal directions (N, dim, D)."""
     d = make_features(count).descriptors.astype(float)
     return d, lift(d, make_words(), adversarial, dim, np.random.default_rng(7))[0]
 
@@ -156,7 +156,7 @@ def keeps_the_basis(d: np.ndarray, span: np.ndarray, rng: np.random.Generator) -
 
 
 def keeps_lapacks_signs(d: np.ndarray, span: np.ndarray, rng: np.random.Generator) -> Parameters:
-    """The basis as it comes out of QR: the first vector is always on one side of the first direction of `span`."""
+    """Return the basis of plain QR, whose first vector is always on one side of the first direction of `span`."""
     rows, dim, length = span.shape
     e = rng.uniform(-1, 1, (rows, dim, length))
     mixing = np.linalg.qr(span @ e.transpose(0, 2, 1)).Q
@@ -164,7 +164,7 @@ def keeps_lapacks_signs(d: np.ndarray, span: np.ndarray, rng: np.random.Generato
 
 
 def hides_the_directions(reparameterise: Reparameterise) -> bool:
-    """The first basis vector lies on either side of the first direction, that of an adversarial word from d, equally often."""
+    """Whether the first basis vector is equally often on both sides of the first direction, which leads from d to a word."""
     d, span = lift_examples(1000)
     _, bases = reparameterise(d, span, np.random.default_rng(0))
     cosines = np.einsum("nid,njd->ijn", bases, span)  # (dim, dim, N)
@@ -196,7 +196,7 @@ def test_control_a_basis_with_lapacks_signs_is_detected() -> None:
 
 
 def test_the_plugins_release_hides_the_descriptor(tmp_path: Path) -> None:
-    """The check of `hides_the_descriptor`, on what the plugin releases."""
+    """The check of `hides_the_descriptor`, for releases of the plugin."""
     secret = make_features(200)
     defense = AFFINE(database=make_database(tmp_path, make_words()))
     release = defense.protect(secret, Public(), np.random.default_rng(0))
@@ -213,7 +213,7 @@ def test_the_plugins_release_hides_the_descriptor(tmp_path: Path) -> None:
 
 
 def test_a_word_that_is_the_descriptor_is_never_drawn() -> None:
-    """Half the sub-database is the descriptor itself, so that most draws must be repeated."""
+    """Half of the sub-database is the descriptor itself, so most draws must be repeated."""
     secret = make_features(1)
     assert secret.codes is not None
     words = np.concatenate([np.repeat(secret.codes, 10, axis=0), make_words(10)])
@@ -267,7 +267,7 @@ def test_dimensions_up_to_one_below_the_space(tmp_path: Path) -> None:
     ("wrong", "message"),
     [
         ({"dim": 0}, "affine: dim must be at least 1, got 0"),
-        ({"dim": 3}, "affine: dim must be even where half of it is adversarial, got 3"),
+        ({"dim": 3}, "affine: dim must be even with lifting=hybrid, got 3"),
         ({"sub_databases": 0}, "affine: sub_databases must be at least 1, got 0"),
         ({"lifting": "sub-hybrid"}, "affine: lifting must be random, adversarial or hybrid, got sub-hybrid"),
     ],

@@ -57,14 +57,14 @@ def exp_bounds(power: Fraction, terms: int) -> tuple[Fraction, Fraction]:
 
 
 def chance_bounds(epsilon: float, domain: int, size: int, terms: int = 160) -> tuple[Fraction, Fraction]:
-    """Eq. (5) in rationals."""
+    """Return bounds of Eq. (5) in rationals."""
     bounds = exp_bounds(to_fraction(epsilon), terms)
     low, high = (size * power / (size * power + domain - size) for power in bounds)
     return low, high
 
 
 def short(value: Any) -> str:
-    """A parameter's name in pytest's output."""
+    """Return the name of a parameter in pytest's output."""
     return f"2^{value.bit_length() - 1}" if isinstance(value, int) and value > 2**60 else str(value)
 
 
@@ -74,7 +74,7 @@ def chance(epsilon: float, domain: int, size: int) -> float:
 
 
 def enumerate_sets(epsilon: float, domain: int, size: int) -> dict[tuple[int, ...], list[float]]:
-    """Pr(Z | v) for all sets Z and all v, with the normalisation of DESIGN.md."""
+    """Return Pr(Z | v) for all sets Z and all v, normalised to sum to 1 over Z."""
     total = size * math.exp(epsilon) + domain - size
     inside, outside = (domain * weight / total / math.comb(domain, size) for weight in (math.exp(epsilon), 1.0))
     return {Z: [inside if v in Z else outside for v in range(domain)] for Z in combinations(range(domain), size)}
@@ -108,7 +108,7 @@ def test_digits_of_p_against_rational_arithmetic_anywhere(epsilon: float, domain
 
 
 def test_epsilon_is_the_decimal_that_it_is_written_as() -> None:
-    """The double 0.1 is not one tenth; their p differ from the 58th digit on."""
+    """The double 0.1 is not one tenth. Their values of p differ from the 58th digit on."""
     low, high = chance_bounds(0.1, 6, 2)
     binary = [2 * power / (2 * power + 4) for power in exp_bounds(Fraction(0.1), 160)]
     digits = chance_digits(0.1, 6, 2, 128)
@@ -161,7 +161,7 @@ def test_log10_of_p(epsilon: float, domain: int, size: int) -> None:
 
 
 class Scripted:
-    """A generator whose bits are given numbers of 320 bits, one per row, returned for the rows that still equal p."""
+    """A generator with a given number of 320 bits per row. It returns the next bits of the rows that still equal p."""
 
     def __init__(self, numbers: list[int], chance: int) -> None:
         self.numbers, self.chance, self.calls = numbers, chance, 0
@@ -180,7 +180,7 @@ class Scripted:
     [(10.0, 256_000, 2), (0.1, 6, 3), (40.0, 7, 2), (10.0, 2**128, 2), (10.0, 2**4096, 2)],
     ids=short,
 )
-def test_draw_goes_on_where_the_bits_equal_those_of_p(epsilon: float, domain: int, size: int) -> None:
+def test_draw_continues_while_the_bits_equal_those_of_p(epsilon: float, domain: int, size: int) -> None:
     low, high = chance_bounds(epsilon, domain, size, terms=400)
     digits = math.floor(low * 2**320)
     assert digits == math.floor(high * 2**320), "the reference is not fine enough"
@@ -195,7 +195,7 @@ def test_draw_goes_on_where_the_bits_equal_those_of_p(epsilon: float, domain: in
     assert [number >> 256 < digits >> 256 for number in numbers] != expected or not any(expected)
 
 
-def test_draw_of_certainty_and_of_nothing() -> None:
+def test_draw_with_probability_one_and_of_no_rows() -> None:
     rng = np.random.default_rng(0)
     assert draw_inclusion(1000, math.inf, 6, 2, rng).all()
     assert draw_inclusion(1000, 3.0, 2, 2, rng).all()
@@ -207,7 +207,7 @@ def test_draw_of_certainty_and_of_nothing() -> None:
 
 
 def subsets_fit(sampler: Sampler, domain: int, size: int, epsilon: float, draws: int = 10**6, true: int = 2) -> float:
-    """p-value of χ² between `draws` sets and the enumeration."""
+    """Return the p-value of χ² between `draws` sets and the enumeration."""
     rng = np.random.default_rng([domain, size, int(epsilon * 10)])
     words = sampler(np.full(draws, true), domain, epsilon, size, rng)
     law = enumerate_sets(epsilon, domain, size)
@@ -239,7 +239,7 @@ def test_enumeration_sums_to_one_and_its_ratio_is_e_to_the_epsilon() -> None:
 
 
 def mechanism_with(wrong_chance: Callable[[float, int, int], float]) -> Sampler:
-    """The mechanism with another p."""
+    """Return the mechanism with another p."""
 
     def sample(true: np.ndarray, domain: int, epsilon: float, size: int, rng: np.random.Generator) -> np.ndarray:
         included = rng.random(len(true)) < wrong_chance(epsilon, domain, size)
@@ -254,7 +254,7 @@ def mechanism_with(wrong_chance: Callable[[float, int, int], float]) -> Sampler:
 
 
 def true_word_first(true: np.ndarray, domain: int, epsilon: float, size: int, rng: np.random.Generator) -> np.ndarray:
-    """The mechanism with the right law of sets, but with an order that reveals the true word."""
+    """Return sets with the right distribution, in an order that reveals the true word."""
     return mechanism_with(chance)(true, domain, epsilon, size, rng)
 
 
@@ -280,7 +280,7 @@ def test_control_a_wrong_p_fails(wrong: Callable[[float, int, int], float], size
 
 def test_control_others_that_may_be_the_true_word_fail() -> None:
     def unshifted(true: np.ndarray, domain: int, epsilon: float, size: int, rng: np.random.Generator) -> np.ndarray:
-        """Draws the others from all of K where u = 0."""
+        """Draw the other words from all of K if u = 0."""
         included = draw_inclusion(len(true), epsilon, domain, size, rng)
         words = draw_word_subsets(true, domain, math.inf, size, rng)
         words[~included] = draw_distinct(int((~included).sum()), domain, size, rng)
@@ -290,7 +290,7 @@ def test_control_others_that_may_be_the_true_word_fail() -> None:
 
 
 def sampled_ratio(epsilon: float, domain: int, size: int, included: Fraction) -> Fraction:
-    """Greatest Pr(Z | v1) / Pr(Z | v2) of the mechanism's steps: u with probability `included`, then a uniform set of others."""
+    """Return the greatest Pr(Z | v1) / Pr(Z | v2) of the mechanism's steps: u with probability `included`, then a uniform set."""
     law = {
         Z: [
             included / math.comb(domain - 1, size - 1) if v in Z else (1 - included) / math.comb(domain - 1, size)
@@ -365,7 +365,7 @@ def test_every_row_is_a_set_of_words(domain: int, epsilon: float, data: st.DataO
 
 
 def order_fits(sampler: Sampler, domain: int = 1000, size: int = 3) -> float:
-    """p-value of: where the true word is included, it has each position equally often. True words are uniform."""
+    """Return the p-value of the hypothesis that an included true word has all positions equally often. True words are uniform."""
     rng = np.random.default_rng(5)
     true = rng.integers(domain, size=200_000)
     words = sampler(true, domain, 5.0, size, rng)
@@ -373,13 +373,13 @@ def order_fits(sampler: Sampler, domain: int = 1000, size: int = 3) -> float:
     return float(stats.chisquare(np.bincount(positions, minlength=size)).pvalue)
 
 
-def test_order_carries_nothing() -> None:
+def test_the_order_of_words_reveals_nothing() -> None:
     assert order_fits(draw_word_subsets) > ALPHA
     words = draw_word_subsets(np.arange(1000), 1000, 5.0, 4, np.random.default_rng(0))
     assert (np.diff(words, axis=1) > 0).all()  # a function of the set alone
 
 
-def test_control_the_true_word_first_is_caught() -> None:
+def test_control_the_true_word_first_is_detected() -> None:
     assert subsets_fit(true_word_first, 6, 2, 1.0) > ALPHA  # the sets alone do not show it
     assert order_fits(true_word_first) < CERTAINLY_WRONG
 
@@ -439,7 +439,7 @@ def test_the_accurate_size_has_the_least_variance() -> None:
 
 @pytest.mark.slow
 def test_inclusion_rates_against_multi_freq_ldpy() -> None:
-    """As sets; its order reveals the true word, as `test_audit.py` detects."""
+    """They are compared as sets. The order of its words reveals the true word, as `test_audit.py` detects."""
     from multi_freq_ldpy.pure_frequency_oracles.SS import SS_Client
 
     domain, epsilon, true, rows = 64, 2.0, 20, 30_000
@@ -451,7 +451,7 @@ def test_inclusion_rates_against_multi_freq_ldpy() -> None:
     rng = np.random.default_rng(2)
 
     def agree(ours: np.ndarray) -> float:
-        """The lesser p-value of: equal rates of the true word; equal rates of the others."""
+        """Return the smaller p-value of two hypotheses: equal rates of the true word, and equal rates of the others."""
         counts = np.bincount(ours.ravel(), minlength=domain)
         true_word = stats.chi2_contingency(
             [[counts[true], rows - counts[true]], [theirs[true], rows - theirs[true]]], correction=False
@@ -616,7 +616,7 @@ def test_supported_settings_are_valid() -> None:
 
 
 def repeating_features(count: int) -> Features:
-    """Each of `count` descriptors twice."""
+    """Return features with each of `count` descriptors twice."""
     return make_features(count).take(np.repeat(np.arange(count), 2))
 
 
@@ -632,7 +632,7 @@ def test_equal_words_get_equal_answers_only_when_memoized(tmp_path: Path) -> Non
 
 @pytest.mark.slow
 def test_memoized_answers_have_the_law_of_the_mechanism(tmp_path: Path) -> None:
-    """Over devices, not over keypoints."""
+    """The law is that of answers over devices, not over keypoints."""
     asset, public = make_dictionary(tmp_path, 6), Public()
     one, defense = make_features(1), LDP(dictionary=asset, epsilon=1.0, memoize=True)
     nearest = int(nearest_by_hand(one, public.dictionary(asset).words)[0])
@@ -662,7 +662,7 @@ SPEEDS = [(2, 64, "seeded"), (2, 256_000, "seeded"), (2, 2**30, "seeded"), (12, 
 
 
 def works(size: int, domain: int, generator: str) -> dict[str, Callable[[], object]]:
-    """Sampling, and its floor: m + 1 random 64-bit words per descriptor."""
+    """Sampling, and its floor: drawing m + 1 random 64-bit numbers per descriptor."""
     rng = protection.create_generator(bytes(32)) if generator == "cipher" else np.random.default_rng(0)
     true = np.random.default_rng(1).integers(domain, size=ROWS)
     return {

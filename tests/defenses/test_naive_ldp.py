@@ -31,7 +31,7 @@ def make_features(count: int, seed: int = 0, codes: bool = True) -> Features:
 
 
 def draw_repeatedly(epsilon: float, count: int) -> np.ndarray:
-    """Whether each pattern of the sets is the descriptor, for many copies of one. -> (N, m) bool"""
+    """Return whether each released pattern is the descriptor, for many copies of it. -> (N, m) bool"""
     one = make_features(1)
     assert one.codes is not None
     many = Features(
@@ -51,7 +51,7 @@ Sampler = Callable[[np.ndarray, float, int, np.random.Generator], np.ndarray]
 
 
 def pairs_fit(sampler: Sampler, epsilon: float, draws: int = 10**6, true: int = 77) -> float:
-    """Lesser p-value of two tests: χ² of sets of two bytes against all C(256, 2) of them, and the rate of the true one."""
+    """Return the smaller p-value of two tests: χ² over all C(256, 2) sets of two bytes, and the rate of the true byte."""
     drawn = sampler(np.full((draws, 1), true, dtype=np.uint8), epsilon, 2, np.random.default_rng(0))
     assert drawn.shape == (draws, 2, 1)
     low, high = np.sort(drawn[..., 0].astype(int), axis=1).T
@@ -74,7 +74,7 @@ def test_sets_of_bytes_against_enumeration(epsilon: float) -> None:
 
 @pytest.mark.slow
 def test_control_an_approximate_domain_fails() -> None:
-    """Drawing u for |K| = 256 + 8, and with the approximation p = m e^ε / |K|."""
+    """u is drawn for |K| = 256 + 8, or with the approximation p = m e^ε / |K|."""
 
     def sampler(domain: float) -> Sampler:
         def sample(true: np.ndarray, epsilon: float, size: int, rng: np.random.Generator) -> np.ndarray:
@@ -97,7 +97,7 @@ def test_control_an_approximate_domain_fails() -> None:
 
 
 class Repeating:
-    """A generator of which the first patterns are given; the later ones are random."""
+    """A generator whose first patterns are given, and whose later ones are random."""
 
     def __init__(self, *given: np.ndarray) -> None:
         self.given, self.rng = list(given), np.random.default_rng(0)
@@ -137,7 +137,7 @@ def test_rows_are_in_byte_order(seed: int, size: int, length: int, epsilon: floa
         assert patterns == sorted(set(patterns))
 
 
-def test_order_carries_nothing_and_the_control_is_caught() -> None:
+def test_the_order_of_patterns_reveals_nothing_and_the_control_is_detected() -> None:
     rng = np.random.default_rng(0)
     true = rng.integers(256, size=(50_000, 128), dtype=np.uint8)
     drawn = draw_pattern_subsets(true, math.inf, 2, rng)
@@ -178,7 +178,7 @@ def test_the_rate_at_a_chance_of_one_half() -> None:
 
 
 def compute_second_position_chance() -> float:
-    """Chance that the repeated descriptor's bytes come after a random pattern's."""
+    """Return the probability that the bytes of the repeated descriptor follow those of a random pattern."""
     codes = make_features(1).codes
     assert codes is not None
     return int.from_bytes(codes[0].tobytes(), "big") / 2**1024
@@ -215,7 +215,7 @@ def test_an_included_float_descriptor_is_unchanged() -> None:
     np.testing.assert_allclose(release.candidates[:, 0], secret.descriptors, atol=1e-7)
 
 
-def test_components_that_are_no_finite_number_are_read_as_zero() -> None:
+def test_components_that_are_not_finite_are_read_as_zero() -> None:
     values = np.zeros((1, 2, 4), dtype="<f4")
     values[0, 0] = [np.nan, 3.0, -np.inf, -4.0]
     values[0, 1] = [np.inf, np.nan, -np.inf, np.nan]

@@ -52,7 +52,7 @@ def test_cannot_send_what_the_extractor_does_not_provide() -> None:
 
 
 def test_scales_and_orientations_are_those_of_the_keypoints() -> None:
-    """Twice the picture, twice the scale; a quarter turn, a quarter more of orientation."""
+    """An image of twice the size has twice the scales, and a quarter turn adds a quarter turn to orientations."""
     picture = draw_texture(0, (128, 128))
     small = Sift(upright=False).extract(np.array(picture))
     large = Sift(upright=False).extract(np.array(picture.resize((256, 256))))

@@ -27,7 +27,7 @@ ALPHA, CERTAINLY_WRONG = 1e-4, 1e-9
 
 
 def theorem(plateau: set[int], domain: int, epsilon: float, size: int) -> dict[tuple[int, ...], float]:
-    """Pr(Z | v) for all sets Z, by counting those with a word of the plateau."""
+    """Return Pr(Z | v) for all sets Z, by counting those with a word of the plateau."""
     sets = list(combinations(range(domain), size))
     weights = [math.exp(epsilon) if plateau & set(Z) else 1.0 for Z in sets]
     return {Z: weight / sum(weights) for Z, weight in zip(sets, weights, strict=True)}
@@ -53,7 +53,7 @@ def test_sets_against_the_theorem(domain: int, size: int, near: int, epsilon: fl
 
 @pytest.mark.slow
 def test_the_sampler_has_the_law_of_the_theorem() -> None:
-    """To within 2^-58, like the digits of p: by all sequences of its draws."""
+    """All sequences of draws are enumerated. The law agrees to within 2^-58, the precision of p."""
     domain, size, epsilon = 5, 2, 1.0
     intersecting, every = math.comb(5, 2) - math.comb(3, 2), math.comb(5, 2)
     p = Fraction(chance_digits(epsilon, every, intersecting, 128), 2**128)
@@ -134,7 +134,7 @@ class OneWordForAll(Plateau):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class AsManyAsAreAlike(Plateau):
-    """A plateau of more words for one half of the dictionary, so that normalisers differ."""
+    """Uses a larger plateau for one half of the dictionary, so that normalisers differ."""
 
     def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> WordSets:
         loaded = public.dictionary(self.dictionary)
@@ -171,12 +171,12 @@ def test_broken_variants_are_detected(tmp_path: Path) -> None:
         ({"words": 1}, "words must be 0 for all"),
     ],
 )
-def test_mistakes(given: dict[str, float], complaint: str) -> None:
+def test_invalid_settings_are_refused(given: dict[str, float], complaint: str) -> None:
     with pytest.raises(UserError, match=complaint):
         Plateau(**given)  # type: ignore[arg-type]
 
 
-def test_a_dictionary_may_be_too_small(tmp_path: Path) -> None:
+def test_a_dictionary_with_too_few_words_is_refused(tmp_path: Path) -> None:
     defense = Plateau(near=9, dictionary=write_dictionary(tmp_path, 8))
     with pytest.raises(UserError, match="near 9, but the dictionary has 8 words"):
         defense.protect(draw_features(3), Public(), np.random.default_rng(0))

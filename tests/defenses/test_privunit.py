@@ -130,7 +130,7 @@ def test_a_broken_variant_is_detected(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("epsilon", [0.0, -1.0, math.inf, math.nan])
-def test_mistakes(epsilon: float) -> None:
+def test_invalid_settings_are_refused(epsilon: float) -> None:
     with pytest.raises(UserError, match="epsilon must be above 0 and finite"):
         PrivUnit(epsilon=epsilon)
 

@@ -18,7 +18,9 @@ from bench.mechanisms.composition import solve_epsilon
 from bench.mechanisms.subset import log10_chance, most_accurate_size, most_informative_size, mutual_information
 from defenses.ldp import LDP
 
-PAGE = (Path(__file__).resolve().parents[2] / "docs" / "guarantee.md").read_text(encoding="utf-8")
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+PAGE = (DOCS / "guarantee.md").read_text(encoding="utf-8")
+PROSE = " ".join(PAGE.split())  # without line breaks
 COMMANDS = re.findall(r"^bench (.+)$", PAGE, re.MULTILINE)
 MILLION = "audit --defense ldp:epsilon=2,subset_size=2 --words 64 --trials 1000000"
 
@@ -54,13 +56,13 @@ def test_numbers() -> None:
     shipped: Dictionary = Public().dictionary("shipped")
     words = len(shipped)
     assert words == 256_000
-    assert f"{math.exp(10):,.0f} times" in PAGE
+    assert f"{math.exp(10):,.0f} times" in PROSE
     descriptor_epsilon = solve_epsilon(10.0, 1000)
-    assert f"About {descriptor_epsilon:.3f}: then" in PAGE
+    assert f"about {descriptor_epsilon:.3f} for each descriptor" in PROSE
     one_in = 2 / 10 ** log10_chance(descriptor_epsilon, words, 2)
-    assert f"one released word in {round(one_in, -3):,.0f} is the true one" in PAGE
-    assert f"**{most_informative_size(10.0, words)}** of 256,000 words" in PAGE
-    assert f"**{most_accurate_size(10.0, words)}** at the same point" in PAGE
+    assert f"one released word in {round(one_in, -3):,.0f} is the true one" in PROSE
+    assert f"**{most_informative_size(10.0, words)}** of 256,000 words" in PROSE
+    assert f"**{most_accurate_size(10.0, words)}** words at the same point" in PROSE
 
 
 def test_table_of_subset_sizes() -> None:
@@ -80,6 +82,19 @@ def test_table_of_subset_sizes() -> None:
         assert f"{mutual_information(6.534, 8000, np.array([int(size)]))[0] / math.log(2):.2f}" == bits
 
 
+def test_measured_recalls_are_those_of_table_s1() -> None:
+    header, _, *rows = re.findall(r"^\| .*", (DOCS / "results" / "tableS1.md").read_text(encoding="utf-8"), re.MULTILINE)
+    names, *entries = ([entry.strip() for entry in re.split(r"(?<!\\)\|", row)[1:-1]] for row in (header, *rows))
+    table = [dict(zip(names, row, strict=True)) for row in entries]
+    recalls = {
+        row["m"]: float(row["day_0.25m_2deg, ours"].split()[0]) / 100
+        for row in table
+        if row["our \\|K\\|"] == "8,000" and row["our ε"] == "6.534"
+    }
+    shown = re.findall(r"^\| (\d+)[^|]*\|(?: [\d.]+ \|){3} \**(0\.\d+)", PAGE, re.MULTILINE)
+    assert {size: float(recall) for size, recall in shown} == pytest.approx(recalls)
+
+
 def test_largest_bound_of_a_number_of_trials() -> None:
     """For a defense that always releases its word and never another; half of the trials are measured."""
 
@@ -89,4 +104,4 @@ def test_largest_bound_of_a_number_of_trials() -> None:
     for trials in (10**4, 10**6, 10**8):
         assert compute_bound(trials) == pytest.approx(math.log(trials) - 2, abs=0.01)
     assert compute_bound(160_000) == pytest.approx(10, abs=0.02)
-    assert f"a million can show {compute_bound(10**6):.1f}" in PAGE
+    assert f"a million trials can show {compute_bound(10**6):.1f}" in PROSE

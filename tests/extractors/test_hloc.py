@@ -110,7 +110,7 @@ def test_longest_end_of_the_path_names_the_group(tmp_path: Path, photograph: Pat
         ({"name": "other.png"}, "has no features of it"),
     ],
 )
-def test_bad_features_are_explained(tmp_path: Path, photograph: Path, datasets: dict[str, Any], complaint: str) -> None:
+def test_invalid_features_are_explained(tmp_path: Path, photograph: Path, datasets: dict[str, Any], complaint: str) -> None:
     path = features(tmp_path, **datasets)
     with pytest.raises(SampleError, match=complaint):
         extract(path, photograph)
@@ -129,10 +129,10 @@ def test_rotated_photograph_is_refused(tmp_path: Path) -> None:
         extract(features(tmp_path, "a.png"), tmp_path / "a.png")
 
 
-def test_bad_files_are_refused(tmp_path: Path, photograph: Path) -> None:
+def test_invalid_files_are_refused(tmp_path: Path, photograph: Path) -> None:
     with pytest.raises(UserError, match="no such file"):
         Hloc(path=tmp_path / "absent.h5")
     with pytest.raises(UserError, match="not an HDF5 file"):
         Hloc(path=photograph)
-    with pytest.raises(UserError, match="this one has none"):
+    with pytest.raises(UserError, match="this image has none"):
         Hloc(path=features(tmp_path)).extract(np.zeros((256, 256, 3), np.uint8))

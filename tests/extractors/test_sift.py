@@ -65,7 +65,7 @@ def test_about_600_to_1000_keypoints(images):
 
 @pytest.mark.slow
 def test_600_to_1000_keypoints_on_test_photographs(shared_data):
-    """On the photographs that results are reported on, which did not decide the threshold."""
+    """Results are reported on these photographs, and the threshold was not chosen on them."""
     names = (shared_data / "test.txt").read_text().split()[::4]
     counts = [len(Sift().extract(photographs.read(shared_data / "train" / name).pixels)) for name in names]
     assert 600 <= np.median(counts) <= 1000

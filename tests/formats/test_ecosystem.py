@@ -158,7 +158,7 @@ def test_unusable_databases(images: Path, tmp_path: Path) -> None:
     draw_texture(9, (100, 200)).save(images / "b.png")
     with pytest.raises(SampleError, match="the photograph has"):
         ColmapDatabase(path=out).extract(photographs.read(images / "b.png").pixels, images / "b.png")
-    with pytest.raises(UserError, match="this one has none"):
+    with pytest.raises(UserError, match="this image has none"):
         ColmapDatabase(path=out).extract(np.zeros((256, 256, 3), np.uint8))
 
 

@@ -168,7 +168,7 @@ def test_content_hash_depends_on_content_only(copies: dict[str, Path]) -> None:
     assert images[0].pixels.content_hash() == images[1].pixels.content_hash() != before
 
 
-# Damage: which file, which line of it (None for no line), what is done to it, what is said.
+# Damage: the file, its line (None for no line), the edit, and the message.
 LISTED = [
     (1, lambda row: row.rpartition(" ")[0], r"SIMPLE_RADIAL has 4 parameters \(f, cx, cy, k\), but 3 are given"),
     (2, lambda row: row + " 0", r"SIMPLE_RADIAL has 4 parameters \(f, cx, cy, k\), but 5 are given"),
@@ -189,7 +189,7 @@ POSES = [
     (2, lambda row: row.rpartition(" ")[0], "expected qw qx qy qz tx ty tz, but there are 6 fields"),
     (1, replace_field(5, "inf"), "not all of these are finite"),
     (1, replace_field(1, "2"), "the quaternion .* has norm 2"),
-    (3, replace_field(0, "query/day/9.png"), r"a pose of query/day/9\.png, which is no query"),
+    (3, replace_field(0, "query/day/9.png"), r"query/day/9\.png has a pose but is no query"),
     (3, replace_field(0, "query/day/0.png"), "occurs a second time"),
 ]
 
@@ -315,7 +315,7 @@ def test_aachen_needs_both_conditions(copies: dict[str, Path], original: Scene, 
     assert not (tmp_path / "new").exists()
 
 
-def test_aachen_s_folders_of_both_versions(copies: dict[str, Path], original: Scene) -> None:
+def test_folders_of_aachen_in_both_versions(copies: dict[str, Path], original: Scene) -> None:
     """Version 1.1 as downloaded: a COLMAP model, images one folder deeper, and a longer list of queries by night."""
     root = copies["aachen"]
     (root / "images").mkdir()
@@ -341,7 +341,7 @@ def test_aachen_s_folders_of_both_versions(copies: dict[str, Path], original: Sc
         aachen.load(root, "v1.1")
 
 
-def test_aachen_s_own_folders_within_3d_models(copies: dict[str, Path]) -> None:
+def test_folders_of_aachen_within_3d_models(copies: dict[str, Path]) -> None:
     models = copies["aachen"] / "3D-models"
     (models / "aachen_v_1").mkdir()
     for path in list(models.glob("*.*")):

@@ -26,7 +26,7 @@ def release_features(database: Asset, dim: int, seed: int, count: int = 12) -> S
 
 
 def measure_distance(one: Subspaces, i: int, other: Subspaces, j: int) -> float:
-    """The distance of two subspaces, by least squares over the directions of both."""
+    """Return the distance of two subspaces, by least squares over the directions of both."""
     directions = np.concatenate([one.bases[i], other.bases[j]]).astype(np.float64).T  # (D, dim + dim')
     between = (other.origins[j] - one.origins[i].astype(np.float64))[:, None]
     return float(np.linalg.norm(between - directions @ np.linalg.lstsq(directions, between, rcond=None)[0]))
@@ -76,8 +76,8 @@ def test_words_are_reconstructed_exactly(database):
     assert all(row.tobytes() in words_by_bytes for row in found)
 
 
-def test_points_that_are_no_words_are_left_out(rng):
-    """Negative control: noise of a hundredth of a unit is no 8-bit vector."""
+def test_points_that_are_not_words_are_excluded(rng):
+    """Negative control: with noise of a hundredth of the last bit, points are not 8-bit vectors."""
     codes = draw_features(20).codes
     points = unit_rows(codes).astype(np.float64)
     assert len(find_byte_vectors(points)) == 20

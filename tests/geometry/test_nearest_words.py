@@ -40,7 +40,7 @@ def test_agrees_with_faiss_on_floats(rng, words):
 
 @pytest.mark.slow
 def test_words_that_bf16_cannot_distinguish(rng):
-    """Words that differ by one step in one component: only an exact comparison finds the right one."""
+    """The words differ by one step in one component, so only an exact comparison finds the right one."""
     base = rng.integers(100, 156, 128, dtype=np.uint8)
     words = np.repeat(base[None], 4096, axis=0)
     words[np.arange(4096), rng.integers(128, size=4096)] += rng.integers(1, 3, 4096, dtype=np.uint8)

@@ -59,7 +59,7 @@ def test_levels_and_words_by_rank() -> None:
 
 
 def test_results_do_not_depend_on_the_batch(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Results are a function of two words."""
+    """The result for two words is a function of these words alone."""
     codes, borders = words(), np.linspace(0.1, 0.9, 30)
     near = Neighbours(codes)
     batched = near.count_levels(np.arange(300), borders)

@@ -34,7 +34,7 @@ def draw_subspaces(rng: np.random.Generator, count: int, dim: int, length: int =
 
 
 def distances(release: Subspaces, rows: np.ndarray) -> np.ndarray:
-    """dist(D, w) by solving for the coordinates. -> (N, K)"""
+    """Return dist(D, w), by solving for the coordinates. -> (N, K)"""
     found = []
     for origin, basis in zip(release.origins.astype(float), release.bases.astype(float), strict=True):
         offsets = (rows.astype(float) - origin).T  # (D, K)
@@ -53,7 +53,7 @@ def agree(release: Subspaces, words: np.ndarray, count: int) -> bool:
 
 @pytest.fixture
 def words(rng):
-    """Like SIFT's: few large components, many near zero."""
+    """Words similar to SIFT's: few large components, and many near zero."""
     return np.minimum(rng.gamma(0.6, 40.0, (5000, 128)) + 1, 255).astype(np.uint8)
 
 

@@ -1,4 +1,4 @@
-"""Plugins and photographs that are made up for tests."""
+"""Synthetic plugins and photographs for tests."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -37,7 +37,7 @@ FAKES = {
 def install_plugins(
     folder: Path, monkeypatch: pytest.MonkeyPatch, groups: dict[str, dict[str, str]], name: str = "made-up"
 ) -> None:
-    """Make a distribution with these entry points, as if it had been installed."""
+    """Create a distribution with these entry points on the path, as after an installation."""
     info = folder / f"{name.replace('-', '_')}-1.0.dist-info"
     info.mkdir(parents=True)
     (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
@@ -47,13 +47,13 @@ def install_plugins(
 
 
 def draw_texture(seed: int, size: tuple[int, int] = (80, 64)) -> Image.Image:
-    """A blurred random picture, in which SIFT finds keypoints. `size` is width, height."""
+    """Return a blurred random picture in which SIFT finds keypoints. `size` is (width, height)."""
     noise = np.random.default_rng(seed).integers(0, 256, (size[1], size[0], 3), dtype=np.uint8)
     return Image.fromarray(noise).filter(ImageFilter.GaussianBlur(2))
 
 
 def write_album(folder: Path, count: int = 2, first: int = 0) -> Path:
-    """A folder of photographs; those with other numbers are others."""
+    """Write a folder of photographs, which differ between numbers."""
     folder.mkdir(parents=True, exist_ok=True)
     for number in range(first, first + count):
         draw_texture(number).save(folder / f"{number}.png")
@@ -61,7 +61,7 @@ def write_album(folder: Path, count: int = 2, first: int = 0) -> Path:
 
 
 def write_scene(folder: Path, references: int = 3, queries: int = 4) -> Scene:
-    """Blurred noise by cameras at random places; the second half of the queries is by night."""
+    """Write a scene of blurred noise with cameras at random positions. The second half of the queries is by night."""
     rng = np.random.default_rng(7)
 
     def image(name: str, focal: float) -> dict:
@@ -86,7 +86,7 @@ def write_scene(folder: Path, references: int = 3, queries: int = 4) -> Scene:
 def build_trial(
     defense: Defense, secret: Features, *, rng: np.random.Generator | None = None, others: Sequence[Release] = ()
 ) -> Trial:
-    """A trial of a task that judges the release itself, of features without a photograph."""
+    """Return a trial of a task that evaluates the release itself, for features without a photograph."""
     public = Public()
     return Trial(
         sample=EMPTY_SAMPLE,

@@ -1,4 +1,4 @@
-"""The floor of a search's time: its matrix product alone."""
+"""The floor of a search's time: the matrix product alone."""
 
 from collections.abc import Callable
 

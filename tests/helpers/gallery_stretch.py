@@ -1,4 +1,4 @@
-"""A stretch of a walk through the gallery: references, and queries between them."""
+"""A part of a walk through the gallery: references, and queries between them."""
 
 from bench.datasets.gallery import Gallery
 

@@ -17,7 +17,7 @@ from defenses.affine import Affine
 
 
 def extract_sift(count: int, photograph: int = 0) -> Features:
-    """The first keypoints of a built-in photograph."""
+    """Return the first keypoints of a built-in photograph."""
     features = Sift().extract(photographs.read(photographs.list_builtin()[photograph].path).pixels)
     return features.take(np.arange(count))
 
@@ -28,7 +28,7 @@ def build_features(codes: np.ndarray) -> Features:
 
 
 def draw_centres(count: int, seed: int = 0) -> np.ndarray:
-    """Draw words like the centres of large clusters: few zeros, and one greatest component."""
+    """Draw words similar to the centres of large clusters, with few zeros and one greatest component."""
     rng = np.random.default_rng(seed)
     means = rng.gamma(2.0, 1.0, (count, 128)) + 0.1
     return np.rint(means / np.linalg.norm(means, axis=1, keepdims=True) * 512).clip(1, 255).astype(np.uint8)
@@ -60,5 +60,5 @@ def change_bases(release: Subspaces, rng: np.random.Generator) -> Subspaces:
 
 
 def measure_errors(estimates: np.ndarray, secret: Features) -> np.ndarray:
-    """|estimate - descriptor| in float64. (N, D) -> (N,)"""
+    """Return |estimate − descriptor| in float64. (N, D) -> (N,)"""
     return np.linalg.norm(estimates.astype(float) - secret.descriptors, axis=1)

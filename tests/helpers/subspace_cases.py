@@ -21,6 +21,6 @@ def draw_subspaces(rng: np.random.Generator, count: int, dim: int) -> Subspaces:
 
 
 def residual(columns: np.ndarray, target: np.ndarray) -> float:
-    """Distance of the target from the span of the columns."""
+    """Return the distance of the target from the span of the columns."""
     solution = lstsq(columns.astype(np.float64), target.astype(np.float64))[0]
     return float(np.linalg.norm(columns @ solution - target))

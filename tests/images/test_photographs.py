@@ -1,4 +1,4 @@
-"""The rule for photographs, and the error of each kind of invalid file."""
+"""Reading of photographs, and the error for each kind of invalid file."""
 
 from pathlib import Path
 

@@ -175,7 +175,7 @@ def scatter(net, values, coordinates, size=(64, 48)):
 
 @pytest.mark.parametrize("patch", [5, 6])
 def test_keypoints_that_share_a_cell_are_summed(patch, rng):
-    """The rule of `network.py`, whatever the order of the keypoints; patches reach as far on all sides, and not outside."""
+    """The rule of `network.py` holds in any order of keypoints. Patches reach equally far on all sides, and not outside."""
     net, counts = Inverter(Shape(inputs=130, widths=(9, 9), patch=patch, painted=2)).eval(), 8  # index of the count channel
     values = torch.from_numpy(rng.normal(size=(3, 130)).astype(np.float32))
     coordinates = torch.tensor([[7.3, 1.8], [7.6, 1.2], [0.2, 15.7]])
@@ -316,13 +316,13 @@ def test_a_network_initialised_from_one_for_the_same_releases_is_equal(shape):
     weights.initialise_from(fresh, trained, max(1, shape.candidates))
     assert all(torch.equal(value, fresh.state_dict()[name]) for name, value in trained.state_dict().items())
     other = Inverter(dataclasses.replace(shape, inputs=2 * 128 + 3, candidates=0, length=0))  # of fewer slots
-    with pytest.raises(UserError, match="reads other releases"):
+    with pytest.raises(UserError, match="is for other releases"):
         weights.initialise_from(other, trained, 1)
 
 
 @pytest.mark.slow
 def test_training_learns(sources, tmp_path):
-    """Forty steps on two photographs bring the loss well below that of the first."""
+    """Forty steps on two photographs reduce the loss well below that of the first step."""
     import bench.inversion.train as module
 
     losses = []
@@ -383,7 +383,7 @@ def test_a_photograph_is_never_quantised_by_its_own_dictionary(sources, words, t
 
 @pytest.mark.slow
 def test_dictionaries_must_have_equal_size(sources, words, tmp_path):
-    """At the same epsilon, fewer words contain the true word more often."""
+    """At the same ε, sets from a smaller dictionary contain the true word more often."""
     public, few = Public(), Asset(tmp_path / "few.safetensors")
     dictionary.save(tmp_path / "few.safetensors", public.dictionary(words).words[:2000], {"photographs": []})
     defense = LDP(epsilon=6.0, dictionary=words)
@@ -474,7 +474,7 @@ def test_weights_of_another_network_are_refused(spoil, message, tmp_path):
 
 
 def test_weights_outside_the_range_of_half_precision_are_stored_in_single_precision(tmp_path, rng):
-    """A batch norm's variance above 65,504 would be infinite, and its channel silent."""
+    """In half precision, a variance of a batch norm above 65,504 would be infinite and its channel constant."""
     shape, path = Shape(inputs=130), tmp_path / "W.safetensors"
     network = Inverter(shape).eval()
     network.stem[1].running_var.fill_(1e5)

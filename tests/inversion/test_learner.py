@@ -77,7 +77,7 @@ def test_speed_of_a_step(benchmark, ready):
 
 @GROUP
 def test_speed_of_the_bare_products(benchmark, ready):
-    """The floor: the step's operations as products of large matrices in the same precision."""
+    """The floor of a step's time: its operations as products of large matrices in the same precision."""
     learner, _, operations = ready
     factor = torch.randn(SIDE, SIDE).to(pick_dtype(learner.device))
     times = round(operations / (2 * SIDE**3))

@@ -25,7 +25,7 @@ def learn(module, optimizer, seed):
 
 
 def take_step(module, optimizer):
-    """Weights before a step, gradients, weights after it."""
+    """Return the weights before a step, the gradients, and the weights after it."""
     before = {name: weight.detach().clone() for name, weight in module.named_parameters()}
     learn(module, optimizer, 0)
     named = dict(module.named_parameters())
@@ -33,7 +33,7 @@ def take_step(module, optimizer):
 
 
 def test_each_direction_of_a_matrix_moves_about_equally_far(module):
-    """Also of a convolution. The gradient's own directions differ more than that (control)."""
+    """This includes convolutions. The directions of the gradient itself differ more (negative control)."""
     before, gradients, after = take_step(module, Optimizer(module, RATE, decay=0.0))
     for name in MATRICES:
         moved, gradient = (before[name] - after[name]).flatten(1), gradients[name].flatten(1)
@@ -66,7 +66,7 @@ def test_weights_that_are_no_matrix_follow_adamw(module):
 
 @pytest.mark.parametrize("restored", [True, False])
 def test_a_restored_state_gives_the_same_steps(module, restored):
-    """Not so without the state (control)."""
+    """Without the state they differ (negative control)."""
     optimizer = Optimizer(module, RATE, DECAY)
     for seed in range(3):
         learn(module, optimizer, seed)

@@ -42,7 +42,7 @@ def run_half(rank, folder, jointly):
 @pytest.mark.slow
 @pytest.mark.parametrize("jointly", [True, False])
 def test_batch_norm_is_over_the_batch_of_both_processes(jointly, tmp_path):
-    """PyTorch's own, over each process's part, differs (negative control)."""
+    """PyTorch's batch norm over the part of each process differs (negative control)."""
     torch.manual_seed(0)
     images = torch.randn(4, 3, 5, 6, dtype=torch.float64) + torch.arange(4)[:, None, None, None]
     torch.save(images, tmp_path / "images")
@@ -113,7 +113,7 @@ PROCESSES = {
 
 @pytest.mark.exhaustive
 def test_two_processes_train_as_one_with_the_whole_batch(tmp_path, monkeypatch):
-    """The same loss at every step, the same scores. Not so if each process normalises its own part (control)."""
+    """Losses and scores are equal. They differ if each process normalises its own part (negative control)."""
     restore_after_test(monkeypatch)
     found = {}
     for name, (devices, function) in PROCESSES.items():
@@ -155,7 +155,7 @@ def test_a_user_error_in_a_process_is_reported_in_one_line(tmp_path, capsys):
     (folder / "a.png").write_bytes(photographs.list_builtin()[0].path.read_bytes())
     command = ["train", "--defense", "none", "--images", str(folder), "--validation", str(folder), "--out", str(tmp_path / "W")]
     assert main([*command, "--devices", "2"]) == 2
-    assert capsys.readouterr().err.splitlines()[-1].endswith("1 photographs are in both the training and the validation set")
+    assert "1 photographs are in both the training and the validation set" in capsys.readouterr().err.splitlines()[-1]
 
 
 @pytest.mark.parametrize(

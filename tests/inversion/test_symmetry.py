@@ -24,7 +24,7 @@ EIGHT = [(mirrored, turns) for mirrored in (False, True) for turns in range(4)]
 
 
 def match(found, true):
-    """Return for each keypoint of `found` the one of `true` of the same position and orientation, and whether there is one."""
+    """Return for each keypoint of `found` the keypoint of `true` with equal position and orientation, and whether it exists."""
     distances = np.linalg.norm(found.keypoints[:, None] - true.keypoints[None], axis=2)
     turned = np.abs(np.exp(1j * found.frames[:, None, 1]) - np.exp(1j * true.frames[None, :, 1]))
     return (distances + turned).argmin(axis=1), (distances + turned).min(axis=1) < 0.2
@@ -42,7 +42,7 @@ def release_raw(raw):
 @pytest.mark.parametrize(("mirrored", "turns"), EIGHT)
 @pytest.mark.parametrize("upright", [True, False])
 def test_descriptors_are_those_of_the_moved_photograph(upright, mirrored, turns):
-    """SIFT of the moved photograph is the reference; with histograms shifted by one, it is not (control)."""
+    """The reference is SIFT of the moved photograph. Histograms shifted by one differ (negative control)."""
     extractor = Sift(upright=upright)
     symmetry = find_symmetry(extractor, mirrored, turns)
     one, true = extractor.extract(WIDE), extractor.extract(symmetry.transform_image(WIDE))
@@ -120,7 +120,7 @@ def test_only_declared_symmetries_are_used():
 
 @pytest.mark.parametrize(("mirrored", "turns"), EIGHT)
 def test_the_reconstruction_is_equivariant(mirrored, turns):
-    """A transformed release gives the transformed image if all eight are averaged. Not so for one alone (control)."""
+    """Averaged over all eight, a transformed release gives the transformed image. With one it does not (negative control)."""
     torch.manual_seed(0)
     module = Inverter(Shape(inputs=130, widths=(8, 8, 8))).eval()
     release, eight = release_raw(Sift().extract(WIDE)), find_symmetries(Sift())
@@ -151,7 +151,7 @@ def test_position_symmetries_keep_descriptors():
 
 @pytest.mark.slow
 def test_crops_are_drawn_under_every_symmetry(rng):
-    """Descriptors of a crop equal those extracted from its pixels; in another order they do not (control)."""
+    """Descriptors of a crop equal those extracted from its pixels; in another order they differ (negative control)."""
 
     def measure_cosines(symmetries):
         views = [PhotographView("a", PIXELS, Sift().extract(PIXELS))]
@@ -173,7 +173,7 @@ def test_crops_are_drawn_under_every_symmetry(rng):
 
 @pytest.mark.slow
 def test_averaging_over_symmetries_improves_the_shipped_network():
-    """Mean SSIM over three photographs; with a wrong order of the components it is worse (control)."""
+    """The mean SSIM of three photographs improves; with a wrong order of the components it gets worse (negative control)."""
     module = weights.load(ASSETS / "inversion-none.safetensors").module
     upright = find_symmetries(Sift())
     variants = {

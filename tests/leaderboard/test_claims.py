@@ -1,4 +1,4 @@
-"""Verdicts: the bootstrap against SciPy and enumeration, and claims that hold, fail or stay open on made-up numbers."""
+"""Verdicts: the bootstrap against SciPy and enumeration, and claims that hold, fail or stay open for synthetic numbers."""
 
 import dataclasses
 import inspect
@@ -98,7 +98,7 @@ def test_an_order_holds_fails_or_stays_open() -> None:
 
 
 def test_pairing_decides_where_means_alone_do_not() -> None:
-    """Photographs differ far more than rows do. Shuffling destroys the pairs, and the verdict is open."""
+    """Photographs differ far more than rows. Shuffling destroys the pairs, and the verdict is then open."""
     values = sample_values({"a": 0.51, "b": 0.5}, 0.002, common_spread=0.2)
     assert find_verdict(greater(A, B), values) is Verdict.HOLDS
     values[A] = np.random.default_rng(1).permutation(values[A])
@@ -199,7 +199,7 @@ def test_the_papers_values_satisfy_its_claims(name: str) -> None:
 
 
 def test_claims_about_structure_fail_where_they_should() -> None:
-    """Swapping the points of m = 4 and m = 32, and more points with quantisation than raw, refutes two claims and no other."""
+    """Two claims fail, and no other, if m = 4 and m = 32 swap their points and quantisation has more points than raw."""
     rows = tables.load_tables()["tableS2"].build_rows(SETTING)
     paper = collect_paper_values(rows)
     wrong = dict(paper)
@@ -252,7 +252,7 @@ def test_table_4_defenses_release_the_true_word_with_the_papers_probability() ->
 
 @pytest.mark.slow
 def test_table_3_has_the_specified_trials() -> None:
-    """Profile paper: the paper's 10M, 1M, 100k and 10k. Profile cpu: as many as two cores can run."""
+    """Profile `paper` has the paper's 10M, 1M, 100k and 10k. Profile `cpu` has as many as two cores can run."""
     settings = {name: dataclasses.replace(SETTING, profile=profile) for name, profile in PROFILES.items()}
     trials = {
         name: {row.name: dataclasses.asdict(row.task)["trials"] for row in table3.build_rows(setting)}

@@ -1,4 +1,4 @@
-"""Which experiments share a comparison group, and how defenses are ranked there."""
+"""Comparison groups, and the ranking of defenses within a group."""
 
 from pathlib import Path
 from typing import Any
@@ -85,7 +85,7 @@ def test_a_sample_that_one_seed_lacks_is_not_averaged(tmp_path: Path) -> None:
     averaged, *_ = build(tmp_path, reconstructions(NONE, [0.5, 0.9], seed=1), reconstructions(NONE, [0.3], seed=2), *other)
     assert averaged.list_values(averaged.experiments[0], "ssim") == [pytest.approx(0.4)]
     assert averaged.count_missing(averaged.experiments[0]) == 1
-    assert by_defense(averaged)["none"].unranked_reason == "dia has done 1 of 2"
+    assert by_defense(averaged)["none"].unranked_reason == "dia has completed 1 of 2 samples"
 
 
 def test_records_of_many_folders_are_found_and_the_latest_counts(tmp_path: Path) -> None:
@@ -152,7 +152,7 @@ def test_without_an_adapted_attacker_a_defense_is_unranked_and_last(tmp_path: Pa
 
 @pytest.mark.parametrize("attack", [DIA, NEAREST])
 def test_an_incomplete_experiment_ranks_no_defense(tmp_path: Path, attack: dict[str, Any]) -> None:
-    """A defense on which an attack failed at the photographs that leak most must not gain from it."""
+    """A defense must not gain if an attack failed on the photographs that leak most."""
     failed = fabricated.record("1.png", {}, defense=ldp(8.0), attack=attack, status="failed", reason="too dark")
     (group,) = build(
         tmp_path,
@@ -165,7 +165,7 @@ def test_an_incomplete_experiment_ranks_no_defense(tmp_path: Path, attack: dict[
     assert groups["none"].rank == 1
     standing = next(one for name, one in groups.items() if name.startswith("ldp"))
     assert standing.rank is None
-    assert "has done 1 of 2" in str(standing.unranked_reason)
+    assert "has completed 1 of 2 samples" in str(standing.unranked_reason)
     notes = [row.note for row in group_tables.build_pairs_table(group).rows]
     assert any("1 failed: 1.png: too dark" in note for note in notes)
 

@@ -47,7 +47,7 @@ def test_numbers_have_bootstrap_intervals(group: ComparisonGroup) -> None:
 
 
 def test_the_best_is_bold_among_the_strongest_attacks_alone(group: ComparisonGroup) -> None:
-    """A weak attack on a defense makes no column's best: it says little of the defense."""
+    """The values of a weak attack are not the best of a column, since they say little about the defense."""
     table = build_pairs_table(group)
     (ssim,) = (column for column in table.columns if column.name == "ssim")
     index = table.columns.index(ssim)
@@ -56,7 +56,7 @@ def test_the_best_is_bold_among_the_strongest_attacks_alone(group: ComparisonGro
     assert r"\textbf{0.35 {[}0.3, 0.4{]}}" in to_latex(table)
 
 
-def test_what_does_not_apply_has_its_reason(group: ComparisonGroup) -> None:
+def test_rows_that_do_not_apply_state_the_reason(group: ComparisonGroup) -> None:
     table = build_pairs_table(group)
     (row,) = (row for row in table.rows if row.experiment.reason)
     assert row.values["ssim"] is None
@@ -86,7 +86,7 @@ def test_a_single_photograph_has_no_interval(tmp_path: Path) -> None:
 
 
 def test_a_metric_of_some_photographs_shows_their_number(tmp_path: Path) -> None:
-    """Such as the fraction of faces that are found again, where few photographs show one."""
+    """An example is the fraction of faces that are detected again, since few photographs show a face."""
     records = reconstructions(NONE, [0.5, 0.6, 0.7])
     for record, face in zip(records, (None, 1.0, 0.0), strict=True):
         record["metrics"]["face"] = face
@@ -128,7 +128,7 @@ def test_strings_of_users_are_text_in_every_format(tmp_path: Path) -> None:
 
 
 def check_rows(table: GroupTable) -> None:
-    """Markdown keeps one line a row, with as many cells as there are columns, and starts no markup."""
+    """Check that Markdown has one line per row with one cell per column, and that no text starts markup."""
     written = to_markdown(table)
     rows = [line for line in written.splitlines() if line.startswith("|")]
     assert len(rows) == 2 + len(table.rows)
@@ -137,7 +137,7 @@ def check_rows(table: GroupTable) -> None:
     assert not re.search(r"(?<!\\)\]\(javascript", written)
 
 
-def test_a_broken_escape_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_broken_escape_is_detected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(core_table, "escape_markdown", lambda text: text)
     with pytest.raises(AssertionError):
         test_strings_of_users_are_text_in_every_format(tmp_path)

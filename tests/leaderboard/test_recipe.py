@@ -1,4 +1,4 @@
-"""The command that repeats an experiment: the command line reads it as the same experiment."""
+"""The command that repeats an experiment is read by the command line as the same experiment."""
 
 import shlex
 from pathlib import Path
@@ -26,7 +26,7 @@ from leaderboard.recipe import build_recipe
 
 
 def planned(command: str) -> Plan:
-    """The plan of a command, as `bench run` makes it."""
+    """Return the plan that `bench run` builds for a command."""
     program, *words = shlex.split(command)
     assert program == "bench"
     args, extra = cli.build_parser().parse_known_args(words)

@@ -31,7 +31,7 @@ RECONSTRUCTION = Reconstruction(inverter="sketch")
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """With photographs in it, and the fake plugins installed for as long as it is used."""
+    """A folder of photographs, with the fake plugins installed."""
     folder = tmp_path_factory.mktemp("regression")
     write_album(folder / "album", 3)
     with pytest.MonkeyPatch.context() as monkeypatch:
@@ -45,7 +45,7 @@ def before(folder: Path) -> Records:
 
 
 def measure(folder: Path, seeds: range, epsilon: float = 8.0) -> Records:
-    """The first word of each set as a guess, at an ε where about every second set holds the true one."""
+    """Return records of an attack that takes the first word. At this ε about every second set contains the true word."""
     defense = LDP(epsilon=epsilon, dictionary=write_dictionary(folder))
     return [
         record for seed in seeds for record in bench.run([defense], [Guess()], folder / "album", task=RECONSTRUCTION, seed=seed)
@@ -56,11 +56,11 @@ def verdicts(results: list[RegressionResult]) -> dict[str, str]:
     return {result.metric: result.verdict for result in results}
 
 
-# ---- what must pass, and what must fail
+# ---- results that must pass, and results that must fail
 
 
 @pytest.mark.slow
-def test_the_same_again_is_the_same(folder: Path, before: Records) -> None:
+def test_equal_results_have_the_verdict_same(folder: Path, before: Records) -> None:
     results = compare(before, copy.deepcopy(before))
     assert {result.verdict for result in results} == {"same"}
     assert {"angle", "l2", "recovered"} <= set(verdicts(results))
@@ -68,7 +68,7 @@ def test_the_same_again_is_the_same(folder: Path, before: Records) -> None:
 
 @pytest.mark.slow
 def test_other_seeds_are_within_the_tolerance(folder: Path, before: Records) -> None:
-    """And differ, so that something was tolerated."""
+    """They differ, so the tolerance has an effect."""
     results = compare(before, measure(folder, range(2, 4)))
     assert {result.verdict for result in results} == {"same"}
     assert any(result.before != result.after for result in results)
@@ -89,7 +89,7 @@ def test_a_weakened_attack_fails(folder: Path, before: Records, monkeypatch: pyt
 
 @pytest.mark.slow
 def test_a_broken_defense_fails(folder: Path, before: Records, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One that always releases the true word first."""
+    """The defense always releases the true word first."""
     protect = LDP.protect
 
     def telling(self: LDP, secret: Features, public: Any, rng: np.random.Generator) -> WordSets:
@@ -103,7 +103,7 @@ def test_a_broken_defense_fails(folder: Path, before: Records, monkeypatch: pyte
 
 
 @pytest.mark.slow
-def test_a_defense_whose_source_is_another_may_get_better(folder: Path, before: Records, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_defense_with_changed_source_may_get_better(folder: Path, before: Records, monkeypatch: pytest.MonkeyPatch) -> None:
     protect = LDP.protect
 
     def silent(self: LDP, secret: Features, public: Any, rng: np.random.Generator) -> WordSets:
@@ -120,7 +120,7 @@ def test_a_defense_whose_source_is_another_may_get_better(folder: Path, before: 
 
 
 @pytest.mark.slow
-def test_a_weaker_promise_is_worse_without_tolerance(folder: Path, before: Records) -> None:
+def test_a_weaker_guarantee_is_worse_without_tolerance(folder: Path, before: Records) -> None:
     after = copy.deepcopy(before)
     for record in after:
         record["privacy"] |= {"epsilon_descriptor": 8.5}
@@ -152,7 +152,7 @@ def test_a_new_metric_keeps_the_experiment_and_other_settings_cannot_be_compared
 
 
 def test_utility_has_its_own_direction() -> None:
-    """Recall of localization, which no attack takes part in."""
+    """A greater recall of localization is better. No attack takes part."""
 
     def judged(recall: float) -> Records:
         head = {
@@ -186,7 +186,7 @@ def test_tolerance_of_one_sample_is_that_of_students_test(rng: np.random.Generat
 
 @pytest.mark.slow
 def test_false_alarms_are_rare_and_shifts_are_found(rng: np.random.Generator) -> None:
-    """Samples differ by far more than seeds do, which must not matter."""
+    """Samples differ far more than seeds, which has no effect on the verdict."""
 
     def apart(shift: float) -> bool:
         before, after = draw_values(rng, 7, 3, 1.0), draw_values(rng, 7, 3, 1.0)
@@ -197,7 +197,7 @@ def test_false_alarms_are_rare_and_shifts_are_found(rng: np.random.Generator) ->
     assert sum(apart(3.0) for _ in range(200)) >= 198
 
 
-def test_one_seed_takes_the_spread_over_samples_and_one_sample_the_minimum() -> None:
+def test_tolerance_with_one_seed_is_the_bootstrap_and_with_one_sample_the_minimum() -> None:
     before = {str(sample): [0.0] for sample in range(7)}
     steady = {str(sample): [0.1 + sample / 1000] for sample in range(7)}
     mixed = {str(sample): [0.3 * (-1) ** sample] for sample in range(7)}

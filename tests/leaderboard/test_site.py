@@ -1,17 +1,33 @@
-"""The page, in a real browser: what a reader does with it, by mouse, by keyboard and on a phone."""
+"""The page in a real browser: use by mouse, by keyboard and on a phone."""
 
+import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import fabricated
 import pytest
-from fabricated import DIA, ENVIRONMENT, PHOTOGRAPHS, SETTINGS, draw_picture, inapplicable, ldp, localizations, reconstructions
+from fabricated import (
+    DIA,
+    ENVIRONMENT,
+    PHOTOGRAPHS,
+    SETTINGS,
+    draw_picture,
+    inapplicable,
+    ldp,
+    localizations,
+    reconstructions,
+)
 
 from bench.runner.directory import photograph_path, reconstruction_path
 from bench.runner.records import experiment_id
 from leaderboard import site
+from leaderboard.comparison import build_groups, load_records
+from leaderboard.group_tables import build_pairs_table
+from leaderboard.recipe import find_plugin
+from leaderboard.site.experiments import build_view
+from leaderboard.site.overview import build_overview
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 
@@ -114,6 +130,10 @@ def column_button(page: Any, label: str) -> Any:
     return page.locator(".group:visible thead").get_by_role("button", name=label, exact=True)
 
 
+def position(locator: Any) -> dict[str, float]:
+    return dict(locator.bounding_box())
+
+
 def dialog(page: Any) -> Any:
     return page.locator("dialog[open]")
 
@@ -194,7 +214,7 @@ def test_a_row_opens_its_experiment_by_click_and_the_way_back_closes_it(page: An
     assert "ε of a descriptor" in text
     assert "ε of an image, basic composition" in text
     assert "404 (400 to 408)" in text  # 4 for each of 101 (100 to 102) keypoints
-    assert "Covered by no ε: the keypoints' positions, the number of keypoints." in text
+    assert "Not covered by ε: the keypoints' positions, the number of keypoints." in text
     shown.locator("summary").click()
     assert ENVIRONMENT["source"] in shown.inner_text()
     page.go_back()
@@ -269,11 +289,127 @@ def test_another_photograph_can_be_chosen_and_a_missing_one_is_noted(page: Any) 
     assert dialog(page).locator("output").inner_text() == "0.png · SSIM 0.2"
     dialog(page).get_by_role("button", name="1.png").click()
     assert reconstruction.get_attribute("src") != first
-    assert reconstruction.get_attribute("alt") == "The reconstruction of 1.png"
+    assert reconstruction.get_attribute("alt") == "Reconstruction of 1.png"
     dialog(page).get_by_role("button", name="2.png").click()
-    assert "the photograph is not beside these records" in dialog(page).locator("output").inner_text()
+    assert "the results folder has no photograph of this sample" in dialog(page).locator("output").inner_text()
     assert dialog(page).locator(".stage input").is_disabled()
     assert not dialog(page).locator(".original").is_visible()
+
+
+@pytest.mark.exhaustive
+def test_the_pictures_above_the_table_are_of_one_sample_in_the_order_of_the_ranking(page: Any) -> None:
+    pictures = page.locator(".overview:visible li")
+    captions = [re.sub(r"\s+", " ", picture.inner_text()).strip() for picture in pictures.all()]
+    assert captions[:5] == [
+        "photograph 0.png",
+        "ldp epsilon=4, subset_size=2 by dia SSIM 0.2",
+        "ldp epsilon=16, subset_size=2 by dia SSIM 0.5",
+        "affine dim=4 by nearest SSIM 0.6",
+        "none by dia SSIM 0.8",
+    ]
+    assert captions[5].endswith("by dia SSIM 0.95")
+    assert captions[6:] == ["new by nearest SSIM 0.01"]
+    page.wait_for_function(
+        "[...document.querySelectorAll('.group:not([hidden]) li img')].every((one) => one.naturalWidth === 256)"
+    )
+    sources = [picture.locator("img").get_attribute("src") for picture in pictures.all()]
+    assert len(set(sources)) == 7
+    assert position(page.locator(".overview:visible"))["y"] < position(page.locator("table:visible"))["y"]
+    # The same files are in the rows, and in the dialogs.
+    rows = page.locator(".group:visible tbody tr:visible .open img")
+    assert [row.get_attribute("src") for row in rows.all()] == sources[1:]
+    pictures.nth(3).locator("a").click()
+    shows(page, "affine against nearest")
+    assert dialog(page).locator(".reconstruction").get_attribute("src") == sources[3]
+    assert dialog(page).locator(".original").get_attribute("src") == sources[0]
+
+
+@pytest.mark.exhaustive
+def test_the_pictures_above_the_table_open_their_experiments_by_keyboard(page: Any) -> None:
+    page.get_by_label("Results").focus()
+    for title in ("ldp against dia", "ldp against dia", "affine against nearest"):
+        page.keyboard.press("Tab")
+        page.keyboard.press("Enter")
+        shows(page, title)
+        page.keyboard.press("Escape")
+        closed(page)
+        page.wait_for_function("document.activeElement.closest('.overview') !== null")  # the focus is back
+    link = page.get_by_role("link", name="Reconstruction of 0.png affine dim=4 by nearest SSIM 0.6")
+    playwright.expect(link).to_be_focused()
+
+
+@pytest.mark.exhaustive
+def test_nothing_moves_when_pictures_load(browser: Any, index: Path) -> None:
+    """The positions of all rows are those of a page without its picture files. The negative control has no sizes."""
+    style = ".overview img, .open img { width: auto !important; height: auto !important; position: static !important }"
+    positions = {}
+    for name in ("loaded", "absent", "loaded without sizes", "absent without sizes"):
+        page = browser.new_page(viewport={"width": 1200, "height": 2000})
+        if name.startswith("absent"):
+            page.route("**/*.webp", lambda route: route.abort())
+        page.goto(index.as_uri())
+        page.wait_for_function("[...document.images].filter((one) => one.checkVisibility()).every((one) => one.complete)")
+        if name.endswith("without sizes"):
+            page.evaluate(
+                """(style) => {
+                    for (const one of document.images) for (const name of ["width", "height"]) one.removeAttribute(name);
+                    const sheet = new CSSStyleSheet();
+                    sheet.replaceSync(style);
+                    document.adoptedStyleSheets.push(sheet);
+                }""",
+                style,
+            )
+        positions[name] = [position(row) for row in page.locator(".group:visible tbody tr:visible").all()]
+        page.close()
+    assert positions["loaded"] == positions["absent"]
+    assert positions["loaded without sizes"] != positions["absent without sizes"]
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_pictures_have_alternative_texts_and_captions_have_contrast(browser: Any, index: Path, scheme: str) -> None:
+    page = browser.new_page(color_scheme=scheme)
+    page.goto(index.as_uri())
+    pictures = page.locator(".overview img, .open img").all()
+    assert {re.sub(r" \d\.png$", "", picture.get_attribute("alt")) for picture in pictures} == {"Photograph", "Reconstruction of"}
+    assert {picture.get_attribute("loading") for picture in pictures} == {"lazy"}
+
+    def contrast(text: str, background: str) -> float:
+        ratio = """([text, background]) => {
+            const style = getComputedStyle(document.documentElement);
+            const luminance = (name) => [0.2126, 0.7152, 0.0722].reduce((sum, weight, channel) => {
+                const value = parseInt(style.getPropertyValue(name).trim().slice(1 + 2 * channel, 3 + 2 * channel), 16) / 255;
+                return sum + weight * (value <= 0.04045 ? value / 12.92 : ((value + 0.055) / 1.055) ** 2.4);
+            }, 0);
+            const [low, high] = [luminance(text), luminance(background)].sort((a, b) => a - b);
+            return (high + 0.05) / (low + 0.05);
+        }"""  # WCAG 2
+        return float(page.evaluate(ratio, [text, background]))
+
+    texts = [("--ink", "--paper"), ("--accent", "--paper"), ("--soft", "--paper"), ("--soft", "--tint")]
+    assert min(contrast(*pair) for pair in texts) >= 4.5
+    assert contrast("--rule", "--paper") < 4.5  # the negative control: no colour of text
+    page.close()
+
+
+@pytest.mark.exhaustive
+def test_on_a_phone_the_photograph_stays_beside_the_reconstructions(phone: Any) -> None:
+    strip, pictures = phone.locator(".overview:visible ul"), phone.locator(".overview:visible li")
+    assert strip.evaluate("(one) => one.scrollWidth > 2 * one.clientWidth")
+    before = position(pictures.first)
+    assert position(pictures.last)["x"] > 360
+
+    def is_uncovered(number: int) -> bool:
+        box, photograph = position(pictures.nth(number)), position(pictures.first)
+        assert photograph["x"] == before["x"]
+        return photograph["x"] + photograph["width"] <= box["x"] and box["x"] + box["width"] <= 360
+
+    pictures.last.locator("a").focus()
+    assert is_uncovered(6)
+    assert not is_uncovered(3)
+    pictures.nth(3).locator("a").focus()
+    assert is_uncovered(3)
+    assert phone.evaluate("document.documentElement.scrollWidth <= document.documentElement.clientWidth")
 
 
 @pytest.mark.exhaustive
@@ -344,6 +480,68 @@ def test_even_a_script_that_got_in_would_not_run(browser: Any, index: Path, tmp_
         owned[name] = page.evaluate("window.owned")
         page.close()
     assert owned == {"with": None, "without": 1}
+
+
+def write_pictured(folder: Path, records: Sequence[dict[str, Any]], pictured: Sequence[dict[str, Any]]) -> Path:
+    """Write records of which some have pictures."""
+    for number, one in enumerate(pictured):
+        draw_picture(reconstruction_path(folder, one), number)
+    return fabricated.write(folder, records)
+
+
+@pytest.mark.slow
+def test_the_sample_above_the_table_is_the_first_that_most_ranked_defenses_have(tmp_path: Path) -> None:
+    def choose(name: str, records: Sequence[dict[str, Any]], pictured: Sequence[dict[str, Any]]) -> str:
+        (group,) = build_groups(load_records(write_pictured(tmp_path / name, records, pictured)))
+        table = build_pairs_table(group)
+        views = [build_view(group, table, row, [], tmp_path / "site", find_plugin) for row in table.rows]
+        overview = build_overview(group, views)
+        assert overview is not None
+        return overview.sample
+
+    none, affine, ranked = (reconstructions(one, [0.8, 0.7, 0.6, 0.5]) for one in (NONE, AFFINE, ldp(4.0)))
+    unranked = [
+        *reconstructions({"name": "new"}, [0.8] * 4, attack=NEAREST),
+        *reconstructions({"name": "newer"}, [0.8] * 4, attack=NEAREST),
+    ]
+    records = [*none, *affine, *ranked, *unranked]
+    pictured = [*none, *affine[1:], *ranked[1:], unranked[0], unranked[4]]
+    assert choose("one", records, pictured) == "1.png"  # three ranked defenses; 0.png has one, and two unranked ones
+    pictured.remove(affine[1])
+    assert choose("two", records, pictured) == "2.png"
+    assert choose("three", records[::-1], pictured) == "2.png"  # workers write records as they finish
+    assert choose("four", unranked, [unranked[1], unranked[2], unranked[6]]) == "2.png"  # without ranks, all rows count
+
+
+@pytest.mark.slow
+def test_a_defense_without_a_picture_shows_the_reason(tmp_path: Path) -> None:
+    none, affine = reconstructions(NONE, [0.8, 0.7]), reconstructions(AFFINE, [0.4, 0.5])
+    failed = fabricated.record("0.png", {}, defense=ldp(8.0), status="failed", reason="out of memory")
+    records = [
+        *none,
+        *affine,
+        *reconstructions(ldp(4.0), [0.2, 0.3])[1:],
+        *[failed, *reconstructions(ldp(8.0), [0.2, 0.3])[1:]],
+        fabricated.record("0.png", {"angle": 40.0}, defense={"name": "other"}, attack=NEAREST),
+        inapplicable({"name": "new"}, DIA, "no network is trained for new"),
+    ]
+    page = site.write([write_pictured(tmp_path / "runs", records, none)], tmp_path / "site").page.read_text(encoding="utf-8")
+    assert re.findall(r'<span class="absent">(.*)</span>', page) == [
+        "The results folder has no photograph of this sample.",
+        "The results folder has no reconstruction of this sample.",
+        "not done",
+        "failed: out of memory",
+        "This attack returns no image.",
+        "n/a: no network is trained for new",
+    ]
+
+
+@pytest.mark.slow
+def test_a_group_without_pictures_has_none_above_its_table(tmp_path: Path) -> None:
+    text = site.write([fabricated.write(tmp_path, localizations(NONE, [1, 0], DAYS[:2]))], tmp_path / "site").page.read_text()
+    assert "<table>" in text
+    assert '<section class="overview"' not in text
+    assert "<img" not in text
 
 
 @pytest.mark.slow

@@ -76,17 +76,17 @@ def test_honest_records_pass_and_are_reproduced(faults: Callable[..., list[Fault
 
 @pytest.mark.slow
 def test_an_attack_that_reads_the_secret_is_found(faults: Callable[..., list[Fault]], folder: Path) -> None:
-    """All numbers of its records are those of `bench run`; only a separate process shows the difference."""
+    """All numbers of its records are those of `bench run`. Only a separate process reveals the difference."""
     cheating = run(folder, Peeker())
     assert all(record["metrics"]["recovered"] == 1 for record in cheating)
     assert faults(cheating) == []
     reported = faults(cheating, sample=2)
     assert {fault.line for fault in reported} == {1, 2}
-    assert any(fault.message.startswith("metrics.recovered: is 1, and 0.") for fault in reported)
+    assert any(fault.message.startswith("metrics.recovered: is 1, but 0.") for fault in reported)
 
 
 @pytest.mark.slow
-def test_another_number_is_found(faults: Callable[..., list[Fault]], honest: Lines) -> None:
+def test_a_changed_number_is_found(faults: Callable[..., list[Fault]], honest: Lines) -> None:
     lied = copy.deepcopy(honest[:2])
     lied[1]["metrics"]["recovered"] *= 0.5
     assert [fault.line for fault in faults(lied, sample=2)] == [2]
@@ -103,7 +103,7 @@ def change(*path: str, to: Any) -> Callable[[dict[str, Any]], None]:
 
 
 def update_hashes(record: dict[str, Any]) -> None:
-    """Hash the changed record again."""
+    """Set the hashes to those of the changed record."""
     task = {"name": record["task"], **record["task_settings"]}
     parts = (task, record["defense"], record["attack"], record["dataset"], record["seed"], record["metric_settings"])
     record["experiment_id"] = records.experiment_id(*parts)
@@ -123,8 +123,8 @@ def update_hashes(record: dict[str, Any]) -> None:
         (change("reason", to="why"), "reason: 'why' is not of type 'null'"),
         (change("defense", "epsilon", to=9.0), "experiment_id: is "),
         (change("environment", "threads", to=99), "run_hash: is "),
-        (change("metrics", "ssim", to=1.5), "metrics.ssim: 1.5 is not from -1 to 1"),
-        (change("metrics", "keypoints", to=3), "privacy.keypoints: not the keypoints"),
+        (change("metrics", "ssim", to=1.5), "metrics.ssim: 1.5 is outside the range from -1 to 1"),
+        (change("metrics", "keypoints", to=3), "privacy.keypoints: differs from metrics.keypoints"),
         (change("privacy", "epsilon_image", to=1.0), "privacy.epsilon_image: is 1.0, should be "),
         (change("privacy", "guarantee", to="perfect"), "privacy.guarantee: is perfect, should be epsilon-ldp"),
         (change("sample", to="7.png"), "sample: the dataset has no '7.png'"),
@@ -147,7 +147,7 @@ def test_false_values_of_one_record(faults: Callable[..., list[Fault]], honest: 
         (change("metric_settings", "ssim", to={}), "metric_settings.ssim is {}"),
     ],
 )
-def test_false_values_of_an_experiment_with_new_hashes(
+def test_false_values_of_an_experiment_with_matching_hashes(
     faults: Callable[..., list[Fault]], honest: Lines, lie: Any, complaint: str
 ) -> None:
     lied = copy.deepcopy(honest[:2])
@@ -169,7 +169,7 @@ def test_pairs_that_do_not_apply_and_pairs_that_do(faults: Callable[..., list[Fa
 @pytest.mark.slow
 def test_missing_and_repeated_samples(faults: Callable[..., list[Fault]], honest: Lines) -> None:
     assert faults(honest[:1]) == [Fault(1, "its experiment lacks 1 of 2 samples, such as '1.png'")]
-    assert faults([*honest[:2], honest[0]]) == [Fault(3, "the same sample of the same experiment as line 1")]
+    assert faults([*honest[:2], honest[0]]) == [Fault(3, "repeats the sample and experiment of line 1")]
     failed = honest[0] | {"status": "failed", "reason": "tired", "metrics": {}, "seconds": None}
     assert faults([failed, *honest[:2]]) == []
 
@@ -177,13 +177,13 @@ def test_missing_and_repeated_samples(faults: Callable[..., list[Fault]], honest
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
-        ("{", "no JSON"),
-        ('{"seconds": NaN}', "NaN is no number"),
+        ("{", "not valid JSON"),
+        ('{"seconds": NaN}', "NaN is not a number"),
         ("[]", "the record: [] is not of type 'object'"),
         ("", "there is no"),
     ],
 )
-def test_lines_that_are_no_records(faults: Callable[..., list[Fault]], text: str, complaint: str) -> None:
+def test_lines_that_are_not_records(faults: Callable[..., list[Fault]], text: str, complaint: str) -> None:
     assert complaint in faults(text)[0].message
 
 
@@ -213,7 +213,7 @@ def test_command(honest: Lines, folder: Path, tmp_path: Path, capfd: pytest.Capt
 
 
 def build_view(needs: frozenset[type[Knowledge]]) -> View:
-    """A release with others beside it, and a database."""
+    """Return a view of a release with other releases and a database."""
     known = {
         OtherReleases: lambda: OtherReleases(draw=lambda count: iter([build_release(seed) for seed in range(count)])),
         PublicDatabase: lambda: PublicDatabase(words=np.zeros((3, 128), np.uint8)),
@@ -233,7 +233,7 @@ def build_release(seed: int) -> Subspaces:
 
 
 def sum_releases(view: View, rng: np.random.Generator) -> np.ndarray:
-    """Use all knowledge of the view, and note what is refused."""
+    """Use all knowledge of the view, and note the refused classes."""
     others = list(view.know(OtherReleases).draw(3))
     view.notes.append(f"{len(view.know(PublicDatabase).words)} words")
     try:
@@ -266,7 +266,7 @@ def camera_and_references(view: View, rng: np.random.Generator) -> np.ndarray:
 
 @pytest.mark.slow
 def test_the_map_comes_without_the_queries(tmp_path: Path) -> None:
-    """One of which is the secret."""
+    """One of the queries is the secret."""
     whole = write_scene(tmp_path)
     public = Public(scene_index=SceneIndex(whole, Sift()))
     view = build_view(frozenset())

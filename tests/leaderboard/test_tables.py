@@ -19,7 +19,7 @@ SIFT = {"name": "sift", "upright": True}
 
 
 def show(table: Table, row: int) -> dict[str, str]:
-    """The texts of a row by the labels of their columns."""
+    """Return the texts of a row by the labels of their columns."""
     return dict(zip((column.label for column in table.columns), table.rows[row].texts, strict=True))
 
 
@@ -49,7 +49,7 @@ def localized(sample: str, recall: float, error: float | None) -> dict[str, Any]
 
 
 def test_a_query_that_was_not_localized_is_the_worst_of_the_median() -> None:
-    """Negative control: averaged over those that survived, the error would be 0.2."""
+    """Negative control: the average over the localized queries alone would be 0.2."""
     queries = [localized("a", 1.0, 0.1), localized("b", 1.0, 0.3), localized("c", 0.0, None), localized("d", 0.0, None)]
     (half,) = tables.build_tables(queries)
     (most,) = tables.build_tables([*queries, localized("e", 1.0, 0.2)])
@@ -83,10 +83,10 @@ def test_the_smaller_of_two_compositions_is_shown() -> None:
     assert "Not covered: the keypoints' positions, the number of keypoints." in shown
 
 
-def test_what_is_not_covered_beyond_that_is_noted() -> None:
+def test_further_uncovered_parts_are_noted() -> None:
     linked = record()["privacy"] | {"uncovered": ["the keypoints' positions", "which keypoints share a word"]}
     (table,) = tables.build_tables([record(privacy=linked)])
-    assert table.rows[0].values["note"] == "not covered either: which keypoints share a word"
+    assert table.rows[0].values["note"] == "also not covered: which keypoints share a word"
     assert tables.build_tables([record()])[0].rows[0].values["note"] == ""
 
 
@@ -95,7 +95,7 @@ def test_a_terminal_shows_how_many_keypoints_there_are() -> None:
     assert "keypoints" in show(table, 0)
 
 
-def test_heading_states_what_was_measured() -> None:
+def test_heading_states_task_dataset_features_and_seed() -> None:
     (table,) = tables.build_tables([record()])
     assert table.heading == "Reconstruction on photos (1 photograph), sift upright features, seed 0"
     oriented = record(run_hash="o", dataset={"name": "photos", "extractor": {"name": "sift", "upright": False}})
@@ -103,7 +103,7 @@ def test_heading_states_what_was_measured() -> None:
     assert "not private" in show_markdown(table)
 
 
-def test_what_does_not_apply_is_neither_blank_nor_zero() -> None:
+def test_values_that_do_not_apply_are_neither_blank_nor_zero() -> None:
     (table,) = tables.build_tables([record(), NA])
     texts = show(table, 1)
     assert [texts[label] for label in ("n", "MAE", "SSIM", "PSNR")] == ["n/a"] * 4
@@ -119,7 +119,7 @@ def test_failures_are_counted_and_listed() -> None:
     assert (table.rows[0].values["photographs"], table.rows[0].values["failed"]) == (1, 1)
     assert "failed: b, ldp:epsilon=10, dia: b.jpg: truncated" in show_markdown(table)
     (all_failed,) = tables.build_tables([failed])
-    assert all_failed.rows[0].values["note"] == "no photograph could be done"
+    assert all_failed.rows[0].values["note"] == "every sample failed"
 
 
 def test_later_record_of_a_sample_replaces_the_earlier() -> None:

@@ -1,4 +1,4 @@
-"""The privacy–utility plot: what is joined, what is on the Pareto front, and how it is figures."""
+"""The privacy–utility plot: the join of two groups, the Pareto front, and the drawing."""
 
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ def build(tmp_path: Path, *parts: list[dict[str, Any]]) -> list[Tradeoff]:
 
 
 def dominated(cost: np.ndarray, gain: np.ndarray) -> list[bool]:
-    """Looked up pair by pair."""
+    """Return whether each point is dominated, by comparison of all pairs."""
     pairs = list(zip(cost, gain, strict=True))
     return [any((c <= a and g >= b) and (c, g) != (a, b) for c, g in pairs) for a, b in pairs]
 
@@ -74,7 +74,7 @@ def test_the_same_photographs_come_before_others(tmp_path: Path) -> None:
 def test_on_another_dataset_the_dictionary_may_differ(tmp_path: Path) -> None:
     own = ldp(8.0) | {"dictionary": "sha256:" + "9" * 64}
     (one,) = build(tmp_path, reconstructions(ldp(8.0), [0.3]), localizations(own, [1], [None]))
-    assert one.caption.endswith("words of a dictionary are those of each")
+    assert one.caption.endswith("; each with its own dictionary")
     other = own | {"dictionary": "sha256:" + "8" * 64}
     assert not build(
         tmp_path / "two", reconstructions(ldp(8.0), [0.3]), localizations(own, [1], [None]), localizations(other, [0], [None])
@@ -105,7 +105,7 @@ def test_each_setting_of_the_server_has_a_plot(tmp_path: Path) -> None:
     ],
     ids=["extractor", "seed", "source"],
 )
-def test_what_cannot_be_compared_is_not_build(tmp_path: Path, other: dict[str, Any]) -> None:
+def test_groups_that_cannot_be_compared_have_no_tradeoff(tmp_path: Path, other: dict[str, Any]) -> None:
     assert not build(tmp_path, reconstructions(NONE, [0.8]), localizations(NONE, [1], [None], **other))
 
 
@@ -142,7 +142,7 @@ def test_families_differ_without_colour() -> None:
     assert list(choose_styles(["b", "a", "b"])) == ["b", "a"]
 
 
-def test_labels_cover_nothing() -> None:
+def test_labels_cover_no_point_label_or_border() -> None:
     rng = np.random.default_rng(0)
     points = [(float(x), float(y)) for x, y in rng.uniform(0, 300, (12, 2))]
     sizes = [(60.0, 12.0)] * len(points)
@@ -160,8 +160,8 @@ def test_labels_cover_nothing() -> None:
     assert position_labels([(5.0, 5.0)], [(400.0, 12.0)], (300.0, 300.0)) == [None]
 
 
-def test_labels_are_read_as_their_points() -> None:
-    """Also where points lie together: some of them have none then."""
+def test_labels_are_nearest_to_their_own_points() -> None:
+    """This includes points that are close together, some of which then have no label."""
     points = [(150.0, 150.0), (150.0, 157.0), (150.0, 164.0), (40.0, 40.0)]
     positions = position_labels(points, [(60.0, 12.0)] * 4, (300.0, 300.0))
     assert positions[3] is not None
@@ -191,7 +191,7 @@ def test_plots_are_drawn_of_the_available_records(tmp_path: Path) -> None:
     assert [tick.get_text()[:8] for tick in figures["attacks"].axes[0].get_yticklabels()] == ["1  ldp:e", "2  ldp:e", "3  none"]
 
 
-def test_the_pages_plot_lies_where_the_numbers_say(tmp_path: Path) -> None:
+def test_points_of_the_pages_plot_are_at_their_values(tmp_path: Path) -> None:
     tradeoffs = build(
         tmp_path,
         reconstructions(NONE, [0.8, 0.6]),

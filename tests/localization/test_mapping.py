@@ -1,4 +1,4 @@
-"""A map of rendered views with known depths, and queries that must, or must not, be localized in it."""
+"""A map of rendered views with known depths, with queries that must be localized in it and queries that must not."""
 
 from collections.abc import Callable
 

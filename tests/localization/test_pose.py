@@ -60,7 +60,7 @@ def test_same_seed_gives_the_same(rng: np.random.Generator) -> None:
 
 
 def test_number_of_trials_is_reported(rng: np.random.Generator) -> None:
-    """All allowed trials if nearly no match is right; the minimum if nearly all are."""
+    """It is the maximum if nearly no match is right, and the minimum if nearly all are."""
     hopeless, easy = problem(rng, true=0, false=200), problem(rng, true=200, false=1)
     for trials in (500, 5000):
         found = pose.estimate(*hopeless[:3], trials=trials, seed=0)

@@ -1,4 +1,4 @@
-"""Bags of words against sums over words."""
+"""Retrieval by bags of words, against sums over words."""
 
 import math
 from collections import Counter
@@ -18,7 +18,7 @@ def bags() -> Bags:
 
 
 def score(query: list[int], bag: list[int]) -> float:
-    """The cosine of tf-idf vectors, times the query's norm."""
+    """Return the cosine of tf-idf vectors, times the norm of the query."""
 
     def weight(word: int) -> float:
         frequency = sum(word in other for other in BAGS)

@@ -1,4 +1,4 @@
-"""Matching: the measures against brute force, and pairs that must be matched, or must not."""
+"""Matching: the measures against brute force, with pairs that must match and pairs that must not."""
 
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Division of a photograph's ε among descriptors, and the command `bench budget`."""
+"""Division of a photograph's ε among its descriptors, and the command `bench budget`."""
 
 import json
 import math
@@ -22,7 +22,7 @@ def test_descriptors_compose_to_the_budget() -> None:
     assert compose_basic(plan.basic_epsilon, 2400) == pytest.approx(10)
     assert compose_optimal(plan.optimal_epsilon, 2400) == pytest.approx(10)
     assert plan.epsilon == plan.optimal_epsilon > plan.basic_epsilon
-    # Where each answer costs much, a small δ buys nothing.
+    # If each answer has a large ε, a small δ does not reduce the total.
     assert divide_budget(8000.0, 800, 1, 256_000).epsilon == pytest.approx(10.0, rel=1e-6)
 
 
@@ -58,12 +58,12 @@ def test_records_of_the_nearest_epsilon() -> None:
     [
         ((-1.0, 10, 1, 100), "--image-epsilon: must be at least 0"),
         ((math.nan, 10, 1, 100), "--image-epsilon: must be at least 0"),
-        ((1.0, 0, 1, 100), "at least 1 keypoint"),
-        ((1.0, 10, 0, 100), "released at least once"),
-        ((1.0, 10, 1, 1), "at least 2 words"),
+        ((1.0, 0, 1, 100), "--keypoints and --releases must be at least 1, got 0 and 1"),
+        ((1.0, 10, 0, 100), "--keypoints and --releases must be at least 1, got 10 and 0"),
+        ((1.0, 10, 1, 1), "--words: must be at least 2, got 1"),
     ],
 )
-def test_mistakes(numbers: Any, complaint: str) -> None:
+def test_invalid_arguments_are_refused(numbers: Any, complaint: str) -> None:
     with pytest.raises(UserError, match=complaint):
         divide_budget(*numbers)
 

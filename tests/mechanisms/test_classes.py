@@ -26,7 +26,7 @@ def exp_bounds(power: Fraction, terms: int = 120) -> tuple[Fraction, Fraction]:
 
 
 def compute_reference_edges(counts: list[int], powers: list[Fraction], bits: int) -> list[int]:
-    """The result of `edges`, from rationals alone."""
+    """Return the result of `edges`, computed with rationals alone."""
     least = min(powers)
     bounds = [exp_bounds(power - least) for power in powers]
     found = []
@@ -73,7 +73,7 @@ def test_special_cases() -> None:
 
 
 class Scripted:
-    """A generator whose numbers are given, 64 bits at a time."""
+    """A generator that returns given numbers, 64 bits at a time."""
 
     def __init__(self, *numbers: int) -> None:
         self.numbers = list(numbers)

@@ -13,7 +13,7 @@ from bench.mechanisms.composition import DELTA, compose, compose_basic, compose_
 
 
 def least_epsilon(epsilon: float, answers: int, delta: float) -> float:
-    """From the definition: no event about N randomised responses may exceed e^ε' times its other chance by more than δ."""
+    """Return the least ε' at which no event of N randomised responses exceeds e^ε' times its other probability by more than δ."""
     truth = math.exp(epsilon) / (1 + math.exp(epsilon))
     pairs = []
     for lies in itertools.product((0, 1), repeat=answers):

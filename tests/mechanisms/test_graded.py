@@ -36,7 +36,7 @@ ALPHA = 1e-4
 
 
 def chances(weights: np.ndarray, size: int) -> dict[tuple[int, ...], float]:
-    """Chances of all sets, when words are drawn one at a time without replacement."""
+    """Return the probability of each set, if words are drawn one at a time without replacement."""
     sets: dict[tuple[int, ...], float] = {}
     for order in permutations(range(len(weights)), size):
         chance, left = 1.0, float(weights.sum())
@@ -68,7 +68,7 @@ def test_words_against_enumeration(size: int) -> None:
 
 
 def measure_frequencies(defense: Defense, secrets: Features, public: Public, draws: int) -> np.ndarray:
-    """Frequencies of words. -> (secrets, K)"""
+    """Return the frequencies of words. -> (secrets, K)"""
     found = []
     for row in range(len(secrets)):
         release = defense.protect(secrets.take(np.full(draws, row)), public, np.random.default_rng(row))
@@ -113,7 +113,7 @@ def test_metric_ldp_has_the_law_of_its_docstring(tmp_path: Path) -> None:
     assert (np.abs(ratios[:, None] - ratios[None]).max(axis=2) <= 5.0 * metric + 1e-9).all()
 
 
-def test_a_guarantee_by_distance_is_no_epsilon(tmp_path: Path) -> None:
+def test_a_guarantee_by_distance_has_no_epsilon_per_descriptor(tmp_path: Path) -> None:
     guarantee = MetricLDP(dictionary=write_dictionary(tmp_path)).privacy(Public())
     assert (guarantee.guarantee, guarantee.epsilon, guarantee.per_distance) == ("d-chi", None, 16.0)
     assert Exponential(dictionary=write_dictionary(tmp_path)).distance(draw_features(2), Public(), 0, 1) == 1
@@ -121,7 +121,7 @@ def test_a_guarantee_by_distance_is_no_epsilon(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_guarantee_by_distance_is_in_no_epsilon_column(tmp_path: Path) -> None:
-    """Neither in records, nor in tables, nor in a leaderboard's sheets, nor among budgets; and the records are of the schema."""
+    """Neither records, tables, the leaderboard's tables nor budgets have it. The records follow the schema."""
     small = write_dictionary(tmp_path)
     defenses = [MetricLDP(dictionary=small), Exponential(dictionary=small)]
     write_album(tmp_path / "photos", 1)
@@ -137,7 +137,7 @@ def test_a_guarantee_by_distance_is_in_no_epsilon_column(tmp_path: Path) -> None
     labels = [column.label for column in table.columns]
     by_distance, by_epsilon = (dict(zip(labels, row.texts, strict=True)) for row in table.rows)
     assert (by_distance["ε/descriptor"], by_distance["ε/image"], by_epsilon["ε/descriptor"]) == ("n/a", "n/a", "10")
-    assert by_distance["note"] == "another promise than ε-LDP: ε = 16 per unit of distance"
+    assert by_distance["note"] == "not ε-LDP: ε = 16 per unit of distance"
     (group,) = comparison.build_groups(comparison.load_records(tmp_path / "run"))
     rows = {row.experiment.metadata["defense"]["name"]: row.values for row in group_tables.build_pairs_table(group).rows}
     assert rows["metric-ldp"]["guarantee"] == "d_χ privacy, ε = 16 per unit of distance"
@@ -187,7 +187,7 @@ class WithoutTheTwo(Exponential):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Rescaled(MetricLDP):
-    """Measures distance in eighths of the unit of its guarantee."""
+    """Measures distances in eighths of the guarantee's unit of distance."""
 
     def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> WordSets:
         sound = MetricLDP(epsilon=8 * self.epsilon, steps=self.steps, dictionary=self.dictionary)
@@ -219,11 +219,11 @@ def test_broken_variants_are_detected(tmp_path: Path) -> None:
         (MetricLDP, {"words": 1}, "words must be 0 for all"),
     ],
 )
-def test_mistakes(plugin: Any, given: dict[str, float], complaint: str) -> None:
+def test_invalid_settings_are_refused(plugin: Any, given: dict[str, float], complaint: str) -> None:
     with pytest.raises(UserError, match=complaint):
         plugin(**given)
 
 
-def test_a_dictionary_may_be_too_small(tmp_path: Path) -> None:
+def test_a_dictionary_with_too_few_words_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="subset_size is 9, but the dictionary has 8 words"):
         Exponential(subset_size=9, dictionary=write_dictionary(tmp_path, 8)).privacy(Public())

@@ -1,4 +1,4 @@
-"""Protection for deployment: the generator, and devices with memoized defenses."""
+"""`bench.protect`: the random generator, and devices with memoized defenses."""
 
 import os
 import stat
@@ -78,7 +78,7 @@ def test_a_device_gives_equal_words_equal_answers(small: Asset, tmp_path: Path) 
     assert (words(bench.protect(features, fresh)) != words(bench.protect(features, fresh))).any()
 
 
-def test_another_configuration_is_another_table(small: Asset, tmp_path: Path) -> None:
+def test_another_configuration_has_other_answers(small: Asset, tmp_path: Path) -> None:
     """Under one key, the bits that decide whether the true word is included would be the same at every ε."""
     features, key = draw_features(300), tmp_path / "key"
     key.write_bytes(bytes(range(32)))  # one device: the fraction included depends on its draws
@@ -106,15 +106,15 @@ def test_the_key_is_created_once_for_its_owner(small: Asset, tmp_path: Path) -> 
     assert key.read_bytes() == key_bytes
 
 
-def test_mistakes(small: Asset, tmp_path: Path) -> None:
+def test_missing_and_invalid_keys_are_refused(small: Asset, tmp_path: Path) -> None:
     features, memoized = draw_features(), LDP(dictionary=small, memoize=True)
-    with pytest.raises(UserError, match=r"ldp, as configured, needs the file of the device's key: protect\(..., device=PATH\)"):
+    with pytest.raises(UserError, match=r"ldp, as configured, needs a file for the device's key: protect\(..., device=PATH\)"):
         bench.protect(features, memoized)
     with pytest.raises(UserError, match="ldp, as configured, is not memoized"):
         bench.protect(features, LDP(dictionary=small), device=tmp_path / "key")
     assert not (tmp_path / "key").exists()
     (tmp_path / "short").write_bytes(b"secret")
-    with pytest.raises(UserError, match="short: a device's key has 32 bytes, this file 6"):
+    with pytest.raises(UserError, match="short: a device's key has 32 bytes, but this file has 6"):
         bench.protect(features, memoized, device=tmp_path / "short")
     with pytest.raises(UserError, match="cannot create or read the device's key: No such file"):
         bench.protect(features, memoized, device=tmp_path / "nowhere" / "key")

@@ -64,7 +64,7 @@ def test_samples_against_enumeration() -> None:
 
 
 def simulate_success(n: int, inclusion: float, wrong: int, trials: int, agreement: float, runs: int = 4000) -> float:
-    """RANSAC on matches that are right or wrong, trial by trial."""
+    """Return the success rate of RANSAC on matches that are right or wrong, simulated trial by trial."""
     rng = np.random.default_rng([n, wrong, trials])
     found = 0
     for _ in range(runs):
@@ -107,7 +107,7 @@ def test_inclusion_is_that_of_the_mechanism() -> None:
 
 
 def test_criteria_disagree() -> None:
-    """At the scaled size of the paper, one criterion selects few words, the other many."""
+    """At the paper's scaled |K|, one criterion selects few words and the other many."""
     rows = estimate_sizes(6.534, 8000, [1, 2, 4, 8, 16, 65], Workload())
     assert max(rows, key=lambda row: row.bits).size == 65
     assert max(rows, key=lambda row: row.success).size <= 2
@@ -123,12 +123,12 @@ def test_criteria_disagree() -> None:
     ("given", "complaint"),
     [
         ((math.inf, 10, [1]), "--epsilon: must be at least 0 and finite"),
-        ((1.0, 1, [1]), "at least 2 words"),
-        ((1.0, 10, [10]), "fewer than the dictionary's 10"),
+        ((1.0, 1, [1]), "--words: must be at least 2, got 1"),
+        ((1.0, 10, [10]), "less than the dictionary's 10"),
         ((1.0, 10, []), "--sizes"),
     ],
 )
-def test_mistakes(given: Any, complaint: str) -> None:
+def test_invalid_arguments_are_refused(given: Any, complaint: str) -> None:
     with pytest.raises(UserError, match=complaint):
         estimate_sizes(*given, Workload())
     with pytest.raises(UserError, match="must be from 0 to 1"):

@@ -26,7 +26,7 @@ SHIFT, SCALE = np.array([-0.030, -0.088, -0.188]), np.array([0.458, 0.448, 0.450
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Random AlexNet weights: the formula does not depend on training."""
+    """Random weights of AlexNet, since the formula does not depend on training."""
     torch.manual_seed(0)
     path = tmp_path_factory.mktemp("weights") / "alexnet.pth"
     torch.save(torchvision.models.alexnet(weights=None).state_dict(), path)
@@ -41,7 +41,7 @@ def images() -> tuple[np.ndarray, np.ndarray]:
 
 
 def by_definition(weights: Path, truth: np.ndarray, estimate: np.ndarray) -> float:
-    """Eq. (1) of the paper: unit-norm features, their squared differences weighed by channel, averaged over positions, summed."""
+    """Return Eq. (1) of Zhang et al.: squared differences of unit-norm features, weighted by channel, averaged and summed."""
     import lpips
 
     network = torchvision.models.alexnet(weights=None).eval()
@@ -127,7 +127,7 @@ def test_it_is_measured_only_on_request(
     assert "lpips" not in metrics("--out", "a")
     assert metrics("--out", "b", "--metric", f"lpips:weights={weights}")["lpips"] > 0
     assert cli.main([*command, "--metric", "ssim", "--out", "c"]) == 2
-    assert "not needed" in capsys.readouterr().err
+    assert "--metric ssim: remove it" in capsys.readouterr().err
     assert cli.main([*command, "--metric", "lpips", "--out", "c"]) == 2
     assert "lpips needs weights (a path)" in capsys.readouterr().err
     assert not Path("c").exists()

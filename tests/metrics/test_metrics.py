@@ -1,4 +1,4 @@
-"""Metrics against scikit-image, against arithmetic on paper, and against chance."""
+"""Metrics against scikit-image, hand-computed values and chance levels."""
 
 import math
 from functools import partial
@@ -46,7 +46,7 @@ def test_image_errors_equal_scikit_image(images: tuple[np.ndarray, np.ndarray]) 
 
 
 def ssim_by_definition(truth: np.ndarray, estimate: np.ndarray) -> float:
-    """Wang et al.'s formula with scipy's Gaussian, away from the border that scikit-image leaves out too."""
+    """Return SSIM by the formula of Wang et al. with SciPy's Gaussian. As in scikit-image, the border does not count."""
     from scipy.ndimage import gaussian_filter
 
     blur = partial(gaussian_filter, sigma=(1.5, 1.5, 0), truncate=3.5, mode="reflect")
@@ -59,7 +59,7 @@ def ssim_by_definition(truth: np.ndarray, estimate: np.ndarray) -> float:
 
 
 def same_ssim(metric: Any, images: tuple[np.ndarray, np.ndarray]) -> bool:
-    """The check that SSIM must pass: both references, to 1e-6."""
+    """Whether SSIM agrees with both references to 1e-6."""
     value = metric(*images)
     library = reference.structural_similarity(
         *(image.astype(np.float64) for image in images),
@@ -256,7 +256,7 @@ def test_values_are_in_range_and_pure(plugin: type[Metric]) -> None:
 
 
 @pytest.mark.parametrize("plugin", IMAGES)
-def test_bad_images_are_refused(plugin: type[Metric]) -> None:
+def test_invalid_images_are_refused(plugin: type[Metric]) -> None:
     good = np.full((16, 16, 3), 0.5, dtype=np.float32)
     nan, bright = good.copy(), good * 255
     nan[3, 4, 1] = np.nan
@@ -272,7 +272,7 @@ def test_bad_images_are_refused(plugin: type[Metric]) -> None:
 
 
 @pytest.mark.parametrize("plugin", DESCRIPTORS)
-def test_bad_descriptors_are_refused(plugin: type[Metric]) -> None:
+def test_invalid_descriptors_are_refused(plugin: type[Metric]) -> None:
     good = np.eye(4, dtype=np.float32)
     nan = good.copy()
     nan[1, 1] = np.nan

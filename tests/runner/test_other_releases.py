@@ -1,4 +1,4 @@
-"""Other users' releases: endless, repeatable, and never of the photograph that is attacked."""
+"""Other users' releases: unlimited, repeatable, and never of the attacked photograph."""
 
 from pathlib import Path
 
@@ -29,13 +29,13 @@ def population(sources: list[Source]) -> ReleasePool:
 
 
 def similarity(release, source: Source) -> float:
-    """How much of a release is seen, mirrored or not, in a photograph at its own size: mean greatest cosine."""
+    """Return the mean greatest cosine of a release's descriptors with those of a photograph at its own size, mirrored or not."""
     seen = [Sift().extract(random_window(source, np.random.default_rng(seed))).descriptors for seed in range(8)]
     return float((unit_rows(release.descriptors) @ np.concatenate(seen).T).max(axis=1).mean())
 
 
 @pytest.mark.slow
-def test_the_list_goes_on_and_is_the_same_each_time(sources) -> None:
+def test_the_list_is_unlimited_and_repeatable(sources) -> None:
     first = list(population(sources).without("0.png")(7))
     assert len(first) == 7
     again = list(population(sources).without("0.png")(9))
@@ -45,7 +45,7 @@ def test_the_list_goes_on_and_is_the_same_each_time(sources) -> None:
 
 
 @pytest.mark.slow
-def test_it_leaves_out_the_attacked_photograph(sources) -> None:
+def test_it_excludes_the_attacked_photograph(sources) -> None:
     releases = list(population(sources).without("0.png")(6))
     to_the_attacked = np.mean([similarity(release, sources[0]) for release in releases])
     to_the_others = np.mean([max(similarity(release, source) for source in sources[1:]) for release in releases])
@@ -54,15 +54,15 @@ def test_it_leaves_out_the_attacked_photograph(sources) -> None:
     assert np.mean([similarity(release, sources[0]) for release in everything[::3]]) > to_the_attacked + 0.05
 
 
-def test_an_attacker_of_one_photograph_sees_what_another_sees(sources) -> None:
-    """The k-th release does not depend on whose attacker asks."""
+def test_attackers_of_different_photographs_see_the_same_releases(sources) -> None:
+    """The k-th release does not depend on the attacked photograph."""
     everyone = population(sources)
     of_first = [release.keypoints for release in everyone.without("0.png")(4)]
     of_second = [release.keypoints for release in everyone.without("1.png")(4)]
     assert any(np.array_equal(a, b) for a in of_first for b in of_second)
 
 
-def test_photographs_that_cannot_be_read_are_passed_over(sources, tmp_path) -> None:
+def test_photographs_that_cannot_be_read_are_skipped(sources, tmp_path) -> None:
     broken = Source("broken.png", tmp_path / "broken.png")
     broken.path.write_bytes(b"no image")
     assert len(list(population([*sources, broken]).without("0.png")(5))) == 5

@@ -1,4 +1,4 @@
-"""Records: what is written is read, and what a crash leaves is mended."""
+"""Records: reading of written records, and repair of files after a crash."""
 
 import json
 import logging
@@ -29,14 +29,14 @@ def write(path: Path, *found: dict[str, Any]) -> Path:
     return path
 
 
-def test_what_is_written_is_read_in_full_precision(tmp_path: Path) -> None:
+def test_records_are_read_in_full_precision(tmp_path: Path) -> None:
     path = write(tmp_path / "deep" / "records.jsonl", record("a"), record("b"))
     assert read(path).records == [record("a"), record("b")]
     assert read(path).records[0]["metrics"]["ssim"] == 0.1 + 0.2
     assert read(path).notice is None
 
 
-def test_records_are_on_file_as_soon_as_they_are_appended(tmp_path: Path) -> None:
+def test_records_are_written_as_soon_as_they_are_appended(tmp_path: Path) -> None:
     with Log(tmp_path / "r") as log:
         log.append(record("a"))
         assert len(read(tmp_path / "r").records) == 1
@@ -50,7 +50,7 @@ def test_no_record_holds_nan_or_infinity(tmp_path: Path, value: float) -> None:
 
 
 @pytest.mark.parametrize("cut", [1, 5, 40])
-def test_line_that_a_crash_cut_off_is_dropped_and_mended(tmp_path: Path, cut: int) -> None:
+def test_line_cut_off_by_a_crash_is_removed(tmp_path: Path, cut: int) -> None:
     path = write(tmp_path / "r", record("a"), record("b"))
     path.write_bytes(path.read_bytes()[:-cut])
     assert [one["sample"] for one in read(path).records] == ["a"]
@@ -118,13 +118,13 @@ def test_a_file_of_schema_1_is_resumed(tmp_path: Path) -> None:
     assert [one["sample"] for one in read(path).records[before:]] == ["new"]
 
 
-def test_file_that_cannot_be_written_is_a_mistake(tmp_path: Path) -> None:
+def test_file_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="cannot write"):
         Log(tmp_path / "file" / "records.jsonl")
 
 
-def test_full_disk_keeps_what_was_written() -> None:
+def test_full_disk_loses_no_written_record() -> None:
     full = Path("/dev/full")
     if not full.exists():
         pytest.skip("this system has no /dev/full")
@@ -145,7 +145,7 @@ def test_dataframe_has_flat_columns_and_the_latest_records(tmp_path: Path) -> No
     assert frame.set_index("sample").loc["a", "metrics.ssim"] == 0.1 + 0.2
 
 
-def test_dataframe_of_nothing(tmp_path: Path) -> None:
+def test_dataframe_without_records(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="no such file"):
         bench.load_records(tmp_path / "absent")
     assert bench.load_records(write(tmp_path / "records.jsonl")).empty

@@ -1,4 +1,4 @@
-"""The runner: determinism, resuming, and surviving what goes wrong."""
+"""The runner: determinism, resumption, and recovery from errors."""
 
 import copy
 import gc
@@ -64,7 +64,7 @@ def written(out: Path) -> list[Record]:
 
 
 def judged(records: list[Record]) -> list[Any]:
-    """Return the records without the time that they took, and without the digest, which covers it."""
+    """Return the records without their duration, and without the digest, which covers it."""
     return [{key: value for key, value in record.items() if key not in ("seconds", "digest")} for record in records]
 
 
@@ -141,7 +141,7 @@ def test_release_depends_on_neither_the_attack_nor_the_order_nor_other_samples(i
     assert [record["metrics"] for record in alone] == [whole["affine", "guess", "1.png"]]
 
 
-def test_releases_that_are_done_with_are_let_go_of_at_once(images: Path, small: Asset) -> None:
+def test_releases_are_freed_after_their_last_use(images: Path, small: Asset) -> None:
     plan = prepare_plan([LDP(dictionary=small)], [Sketch()], images, task=RECONSTRUCTION)
     trials, (experiment,), sample = TrialRunner(plan), plan.experiments, plan.samples[0]
     release = weakref.ref(trials.build_trial(experiment, sample).images[0].release)
@@ -162,7 +162,7 @@ def test_all_attacks_see_the_same_release(images: Path, small: Asset, monkeypatc
         def spoil(self: Any, view: View, rng: np.random.Generator) -> Any:
             seen.append(copy.deepcopy(view))
             estimate = original(self, view, rng)
-            view.release.keypoints[:] = 0  # what one attack does to its release is nothing to the next
+            view.release.keypoints[:] = 0  # a change by one attack does not affect the next
             return estimate
 
         return spoil
@@ -194,13 +194,13 @@ def test_pair_that_does_not_apply_says_why(images: Path, small: Asset) -> None:
     assert records[0]["metrics"] == {}
 
 
-def test_only_inapplicable_pairs_are_a_mistake(images: Path, tmp_path: Path) -> None:
+def test_only_inapplicable_pairs_are_an_error(images: Path, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="guess attacks WordSets or Subspaces; none releases Descriptors"):
         run([Undefended()], [Guess()], images, out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
-def test_attack_whose_knowledge_is_not_there_does_not_apply(images: Path, small: Asset, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_attack_without_its_knowledge_does_not_apply(images: Path, small: Asset, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Sketch, "needs", frozenset({ServerMap}))
     with pytest.raises(UserError, match="sketch needs the server's map; there is none"):
         run([LDP(dictionary=small)], [Sketch()], images)
@@ -210,10 +210,10 @@ def test_attack_whose_knowledge_is_not_there_does_not_apply(images: Path, small:
     assert run([Affine(database=small)], [Sketch()], images)[0]["status"] == "ok"
 
 
-# ---- what goes wrong
+# ---- errors
 
 
-def test_bad_photograph_is_a_failed_record_and_the_others_are_done(images: Path, tmp_path: Path) -> None:
+def test_unreadable_photograph_is_a_failed_record_and_the_others_are_run(images: Path, tmp_path: Path) -> None:
     (images / "0b.jpg").write_bytes(b"\xff\xd8\xff no photograph")
     Image.new("RGB", (64, 64), "grey").save(images / "flat.png")
     records = run([Undefended()], [Sketch(), Sketch(brightness=0.5)], images)
@@ -241,14 +241,14 @@ def test_broken_plugin_fails_its_own_experiments_and_leaves_a_traceback(images: 
         (None, "returned NoneType"),
     ],
 )
-def test_wrong_image_is_noticed(images: Path, monkeypatch: pytest.MonkeyPatch, returned: Any, complaint: str) -> None:
+def test_invalid_image_is_detected(images: Path, monkeypatch: pytest.MonkeyPatch, returned: Any, complaint: str) -> None:
     monkeypatch.setattr(Sketch, "reconstruct", lambda self, view, rng: returned)
     record = run([Undefended()], [Sketch()], [images / "0.png"])[0]
     assert record["status"] == "failed"
     assert re.search(complaint, record["reason"])
 
 
-def test_mistakes_are_found_before_anything_is_written(images: Path, tmp_path: Path) -> None:
+def test_invalid_configurations_are_refused_before_anything_is_written(images: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     empty = tmp_path / "empty"
     empty.mkdir()
@@ -278,7 +278,7 @@ def test_mistakes_are_found_before_anything_is_written(images: Path, tmp_path: P
     assert not out.exists()
 
 
-def test_memory_and_disk_are_not_the_photographs_fault(images: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lack_of_memory_stops_the_run_instead_of_failing_the_photograph(images: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def hungry(self: Any, view: View, rng: np.random.Generator) -> Any:
         raise MemoryError
 
@@ -291,7 +291,7 @@ def test_memory_and_disk_are_not_the_photographs_fault(images: Path, monkeypatch
 
 
 @pytest.mark.slow
-def test_finished_run_is_not_done_again(images: Path, small: Asset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_finished_run_is_not_repeated(images: Path, small: Asset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     grid: Any = ([Undefended(), LDP(dictionary=small)], [Sketch(), Guess()], images)
     first = run(*grid, out=tmp_path / "out")
     before = (tmp_path / "out" / FILE).read_bytes()
@@ -307,7 +307,7 @@ def test_finished_run_is_not_done_again(images: Path, small: Asset, tmp_path: Pa
 
 
 @pytest.mark.slow
-def test_interrupted_run_goes_on_and_ends_as_if_it_had_not_been(images: Path, small: Asset, tmp_path: Path) -> None:
+def test_interrupted_run_resumes_with_the_same_result(images: Path, small: Asset, tmp_path: Path) -> None:
     grid: Any = ([LDP(dictionary=small)], [Sketch(), Guess()], images)
     whole = run(*grid)
     plan = prepare_plan(*grid, task=RECONSTRUCTION)
@@ -357,8 +357,8 @@ def test_damaged_records_stop_the_run_before_it_starts(images: Path, tmp_path: P
 
 
 @pytest.mark.slow
-def test_releases_add_up_and_a_memoized_defense_repeats_itself(images: Path, small: Asset) -> None:
-    """At ε = 5 a set of 512 words holds the true one with a chance of .37; of 12 sets of a keypoint, it is in most."""
+def test_releases_reveal_more_together_unless_the_defense_is_memoized(images: Path, small: Asset) -> None:
+    """At ε = 5 a set of 512 words contains the true word with probability .37. It is then the most frequent word of 12 sets."""
 
     def of(memoize: bool, releases: int) -> tuple[float, dict[str, Any]]:
         defense = LDP(epsilon=5, dictionary=small, memoize=memoize)
@@ -371,14 +371,14 @@ def test_releases_add_up_and_a_memoized_defense_repeats_itself(images: Path, sma
     assert (spent_once["releases"], spent_often["releases"]) == (1, 12)
     assert spent_often["epsilon_image"] == 12 * spent_once["epsilon_image"]
     remembered, spent = of(memoize=True, releases=12)
-    assert remembered > often + 0.1  # and by nothing that is repeated word for word
+    assert remembered > often + 0.1  # but not by repeated answers of a memoized defense
     assert (spent["guarantee"], spent["releases"]) == ("epsilon-ldp-by-word", 1)
     assert spent["epsilon_image"] == spent_once["epsilon_image"]
     assert spent["uncovered"][-1] == "which keypoints share a word"
 
 
 def test_a_memoized_defense_gives_one_answer_in_all_photographs(images: Path, small: Asset) -> None:
-    """The runner hands all photographs' features to one device."""
+    """The runner uses one device for the features of all photographs."""
     seen: dict[int, set[tuple[int, ...]]] = {}
 
     class Watching(LDP):
@@ -397,7 +397,7 @@ def test_a_memoized_defense_gives_one_answer_in_all_photographs(images: Path, sm
 
 
 @pytest.mark.slow
-def test_processes_make_the_same_records(images: Path, small: Asset, tmp_path: Path) -> None:
+def test_processes_write_the_same_records(images: Path, small: Asset, tmp_path: Path) -> None:
     (images / "bad.jpg").write_bytes(b"no photograph")
     engine = engines.choose_engine(workers=2)
     plan = prepare_plan([LDP(epsilon=8, dictionary=small), Undefended()], [Sketch(), Guess()], images, task=RECONSTRUCTION)
@@ -428,7 +428,7 @@ def test_selected_keypoints_alone_are_scored_and_reconstructed(images: Path, mon
 
 
 @pytest.mark.slow
-def test_foreground_and_background_are_scored_apart_in_a_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_foreground_and_background_of_a_scene_are_scored_separately(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(store.VARIABLE, str(tmp_path / "cache"))
     gallery = Gallery(views=1, queries=1, night=0, width=160, height=128, detail=0.2, people=4)
     (record,) = execute.run([Undefended()], [Sketch()], task=RECONSTRUCTION, dataset=gallery)

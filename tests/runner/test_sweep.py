@@ -180,7 +180,7 @@ def test_engines_require_their_options() -> None:
         ((0,), "--workers must be at least 1"),
         ((1, "dusk"), "unknown engine 'dusk'; did you mean 'dask'"),
         ((1, "dask"), "--scheduler is missing"),
-        ((1, "processes", "tcp://x:1"), "--scheduler is for --engine dask"),
+        ((1, "processes", "tcp://x:1"), "--scheduler requires --engine dask"),
     ]:
         with pytest.raises(UserError, match=complaint):
             engines.choose_engine(*arguments)
@@ -206,7 +206,7 @@ def test_a_killed_process_stops_the_run_and_the_next_run_resumes(images: Path, t
     engine = engines.choose_engine(2)
     marker = tmp_path / "killed"
     plan = prepare_plan([Undefended()], [Sketch(), Fatal(marker=str(marker))], images, task=RECONSTRUCTION)
-    with pytest.raises(UserError, match=r"ended from outside.*run again to go on"):
+    with pytest.raises(UserError, match=r"was killed.*run again to continue"):
         list(execute.execute([plan], tmp_path / "out", engine))
     assert marker.exists()
     assert len(list(execute.execute([plan], tmp_path / "out", engine))) == 6
@@ -260,12 +260,12 @@ def test_an_attack_that_kills_every_worker_is_a_failed_record(images: Path, tmp_
     plan = check_plan(build_plan(part, engine.describe))
     fatal, sketch = execute.sort_records([plan], execute.execute([plan], tmp_path / "out", engine))
     assert (fatal["status"], sketch["status"]) == ("failed", "ok")
-    assert "every worker that began this ended" in fatal["reason"]
+    assert "every worker that started this job ended" in fatal["reason"]
 
 
 @pytest.mark.slow
 def test_a_worker_with_other_files_is_refused(images: Path, tmp_path: Path, cluster: Any) -> None:
-    """It would make other records."""
+    """Its records would differ."""
     engine = engines.choose_engine(kind="dask", scheduler=cluster.scheduler_address)
     part = grid(defenses=[Undefended()], attacks=[Sketch()], tasks=[RECONSTRUCTION], images=images)[0]
     plan = check_plan(build_plan(part, engine.describe))
@@ -280,7 +280,7 @@ def test_missing_scheduler(monkeypatch: pytest.MonkeyPatch) -> None:
     from bench.runner.engines import cluster as module
 
     monkeypatch.setattr(module, "PATIENCE", 0.2)
-    with pytest.raises(UserError, match="no scheduler answers there"):
+    with pytest.raises(UserError, match="no scheduler answers at this address"):
         engines.choose_engine(kind="dask", scheduler="tcp://127.0.0.1:9").describe([])
 
 
@@ -422,7 +422,7 @@ def test_interrupted_sweep_resumes(mine: str, monkeypatch: pytest.MonkeyPatch, c
     monkeypatch.setattr(Sketch, "reconstruct", interrupted)
     exit_code, _, messages = bench(capfd, "sweep", mine)
     assert exit_code == 130
-    assert "run the same command again to go on" in messages
+    assert "run the same command again to continue" in messages
     assert read_status(Path("runs/sweep-mine-SUITE")).count == Count(done=2, missing=4)
     assert bench(capfd, "sweep", mine)[0] == 0
     assert len(calls) == 7
@@ -431,7 +431,7 @@ def test_interrupted_sweep_resumes(mine: str, monkeypatch: pytest.MonkeyPatch, c
 
 # ---- the documentation
 
-DOCUMENT = (Path(__file__).resolve().parents[2] / "docs" / "sweeps.md").read_text(encoding="utf-8")
+DOCUMENT = (Path(__file__).resolve().parents[2] / "docs" / "running.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("line", re.findall(r"^bench (.+?)(?:\s+#.*)?$", DOCUMENT, re.MULTILINE))

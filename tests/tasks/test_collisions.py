@@ -1,4 +1,4 @@
-"""Collisions: the measure against brute force, and releases that must, or must not, collide with a descriptor."""
+"""Collisions: the measure against brute force, with releases that must collide with a descriptor and releases that must not."""
 
 from pathlib import Path
 
@@ -113,7 +113,7 @@ def test_number_of_other_releases_is_limited(database: Asset) -> None:
 def test_invalid_settings_are_refused(database: Asset) -> None:
     assert Collisions().explain_not_applicable(create_defense(database), None, Sift(), Public()) is None
     assert "ldp does not say" in str(Collisions().explain_not_applicable(LDP(dictionary=database), None, Sift(), Public()))
-    assert "no word" in str(
+    assert "no database words" in str(
         Collisions().explain_not_applicable(Affine(lifting="random", database=database), None, Sift(), Public())
     )
     for wrong in (

@@ -1,4 +1,4 @@
-"""Words near a subspace: the measure against brute force, and data for which it must succeed or fail."""
+"""Words near a subspace: the measure against brute force, with data for which it must succeed and data for which it must fail."""
 
 from pathlib import Path
 
@@ -52,7 +52,7 @@ def test_measure_is_that_of_brute_force(tmp_path: Path, dim: int, count: int) ->
 
 
 def test_adversarial_words_succeed_by_construction(tmp_path: Path) -> None:
-    """The reason to leave them out: at dimension 10 and N = 5 only they are counted, whatever the data."""
+    """So the measure excludes them: at dimension 10 and N = 5 only they would count, for any data."""
     task, defense = Intersections(), Affine(dim=10, database=write_dictionary(tmp_path, 160))
     metrics = task.evaluate(build_trial(defense, draw_features(12))).metrics
     assert metrics["with_adversarial_top5"] == 1
@@ -88,7 +88,9 @@ def test_defenses_without_words_are_refused(tmp_path: Path) -> None:
     task = Intersections()
     assert task.explain_not_applicable(Affine(database=small), None, Sift(), Public()) is None
     assert "ldp does not say" in str(task.explain_not_applicable(LDP(dictionary=small), None, Sift(), Public()))
-    assert "no word" in str(task.explain_not_applicable(Affine(lifting="random", database=small), None, Sift(), Public()))
+    assert "no database words" in str(
+        task.explain_not_applicable(Affine(lifting="random", database=small), None, Sift(), Public())
+    )
     for wrong in ({"ratio": 0.0}, {"ratio": float("nan")}, {"subspaces": -1}):
         with pytest.raises(UserError, match="must be"):
             Intersections(**wrong)

@@ -159,7 +159,7 @@ def test_no_budget_localizes_nothing(dataset: Path) -> None:
 
 
 def test_random_dictionaries_localize_if_both_sides_share_them(dataset: Path, tmp_path: Path) -> None:
-    """They act as a hash: similar descriptors have the same nearest word. Too few words distinguish nothing."""
+    """They act as a hash, since similar descriptors have the same nearest word. Too few words do not distinguish descriptors."""
     many, few = (LDP(dictionary=write_dictionary(tmp_path, size), epsilon=np.inf, subset_size=1) for size in (2000, 200))
     assert mean(run(dataset, many)) >= 0.8
     assert mean(run(dataset, few)) <= 0.4
@@ -169,7 +169,7 @@ def test_random_dictionaries_localize_if_both_sides_share_them(dataset: Path, tm
 
 
 def run_command(dataset: Path, out: Path, *more: str) -> tuple[int, list[Record]]:
-    """Run `bench run` on raw descriptors and on words. -> its exit status and records"""
+    """Run `bench run` on raw descriptors and on words. Returns its exit status and records."""
     command = ["run", "--task", "localization:trials=3000", "--dataset", f"aachen:path={dataset}", "--out", str(out)]
     defenses = more or ("--defense", "none", "--defense", "ldp:words=1000,epsilon=inf,subset_size=1")
     status = cli.main([*command, "--extractor", "sift:max_keypoints=400", *defenses])
@@ -193,7 +193,7 @@ def copy_with_edit(dataset: Path, out: Path, change: Callable[[str], str]) -> Pa
 def test_withheld_poses_are_exported_and_failures_are_counted(
     dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """As Aachen is downloaded: no ground truth. One query's intrinsics are wrong, so it has no pose."""
+    """As in the download of Aachen, there is no ground truth. The intrinsics of one query are wrong, so it has no pose."""
     withheld = copy_with_edit(dataset, tmp_path / "withheld", _lengthen_focal)
     (withheld / "ground_truth.txt").unlink()
     status, records = run_command(withheld, tmp_path / "out")
@@ -242,7 +242,7 @@ def test_wrong_intrinsics_are_reported_and_not_averaged(
 
 def test_pairs_are_written_and_read_again(dataset: Path, raw: list[Record], tmp_path: Path) -> None:
     path = tmp_path / "pairs.txt"
-    assert next(localization_results.write(raw, tmp_path)) == f"{path}: what was retrieved for 5 queries"
+    assert next(localization_results.write(raw, tmp_path)) == f"{path}: the images retrieved for 5 queries"
     assert pairs.read(path) == {record["sample"]: _retrieved(record) for record in raw}
     again = run(dataset, Undefended(), pairs=path)
     assert [record["metrics"] for record in again] == [record["metrics"] for record in raw]

@@ -23,18 +23,18 @@ def test_each_row_is_supported_by_the_network_of_its_defense() -> None:
     ("ssim", "recall", "expected"),
     [
         ((-0.1, -0.01), (1.0, 9.0), "**dominates**"),
-        ((-0.1, 0.01), (1.0, 9.0), "server does more, attacker inconclusive"),
-        ((0.1, 0.2), (1.0, 9.0), "attacker sees more, server does more"),
+        ((-0.1, 0.01), (1.0, 9.0), "higher recall, SSIM inconclusive"),
+        ((0.1, 0.2), (1.0, 9.0), "higher SSIM, higher recall"),
         ((0.1, 0.2), (-9.0, -1.0), "is dominated"),
-        ((-0.1, 0.2), (-9.0, -1.0), "server does less, attacker inconclusive"),
-        ((-0.2, -0.1), (-9.0, 1.0), "attacker sees less"),
+        ((-0.1, 0.2), (-9.0, -1.0), "lower recall, SSIM inconclusive"),
+        ((-0.2, -0.1), (-9.0, 1.0), "lower SSIM"),
         ((-0.2, 0.1), (-9.0, 1.0), "inconclusive"),
     ],
 )
 def test_verdicts(ssim: tuple[float, float], recall: tuple[float, float], expected: str) -> None:
     assert compare_defenses.describe_verdict(*(Interval(sum(ends) / 2, *ends, 10) for ends in (ssim, recall))) == expected
-    dominating = "Dominating" in compare_defenses.write_summary([("`one`", "inconclusive"), ("`other`", expected)])
+    dominating = "These dominate" in compare_defenses.write_summary([("`one`", "inconclusive"), ("`other`", expected)])
     assert dominating == (expected == compare_defenses.DOMINATES)
-    assert ("higher, beyond chance, for `other`" in compare_defenses.write_summary([("`other`", expected)])) == (
-        "server does more" in expected and not dominating
+    assert ("significantly higher for `other`" in compare_defenses.write_summary([("`other`", expected)])) == (
+        "higher recall" in expected and not dominating
     )

@@ -1,4 +1,4 @@
-"""The check of the vocabulary finds private words in identifiers and text, and allows the listed ones."""
+"""The vocabulary check finds private words in identifiers and text, and allows the listed exceptions."""
 
 from pathlib import Path
 

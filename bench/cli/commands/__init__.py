@@ -1,5 +1,5 @@
-"""The commands of `bench`, one file each, found by file name.
+"""The commands of `bench`: one file each, found by file name.
 
-A command has SUMMARY, optionally EPILOG (examples), REQUIRED (names of required options), `add_options`, and `execute`, which
-returns the exit status. `execute` imports heavy libraries.
+A command has SUMMARY, REQUIRED (names of required options), optionally EPILOG (examples), `add_options`, and `execute`. The
+function `execute` imports heavy libraries and returns the exit status.
 """

@@ -1,4 +1,4 @@
-"""`bench audit`: a lower bound of a defense's epsilon, from its releases."""
+"""`bench audit`: a lower bound of a defense's epsilon, estimated from its releases."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ REQUIRED = ("defense",)
 def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--defense", metavar="SPEC", help="a defense that claims an epsilon")
     parser.add_argument(
-        "--words", type=parse_whole, metavar="K", help="words of a synthetic dictionary (default: the defense's own dictionary)"
+        "--words", type=parse_whole, metavar="K", help="size of a synthetic dictionary (default: the defense's own dictionary)"
     )
     parser.add_argument(
         "--trials",
         type=parse_whole,
         default=100_000,
         metavar="N",
-        help="releases of each of the two descriptors (default: %(default)s)",
+        help="number of releases of each of two descriptors (default: %(default)s)",
     )
     add_seed(parser)
 

@@ -14,16 +14,16 @@ REQUIRED = ("image_epsilon",)
 def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--image-epsilon", type=parse_number, metavar="E", help="epsilon of the whole photograph")
     parser.add_argument(
-        "--keypoints", type=parse_whole, default=1000, metavar="N", help="keypoints of a photograph (default: %(default)s)"
+        "--keypoints", type=parse_whole, default=1000, metavar="N", help="keypoints per photograph (default: %(default)s)"
     )
     parser.add_argument(
-        "--releases", type=parse_whole, default=1, metavar="T", help="releases of the photograph (default: %(default)s)"
+        "--releases", type=parse_whole, default=1, metavar="T", help="number of releases of the photograph (default: %(default)s)"
     )
     parser.add_argument(
-        "--words", type=parse_whole, metavar="K", help="words of the dictionary (default: those of the shipped one)"
+        "--words", type=parse_whole, metavar="K", help="number of words of the dictionary (default: that of the shipped one)"
     )
     parser.add_argument(
-        "--results", type=Path, metavar="DIR", help="results of bench run: shows the records of the nearest epsilon"
+        "--results", type=Path, metavar="DIR", help="results of bench run; shows their records at the nearest epsilon"
     )
 
 

@@ -12,8 +12,8 @@ if TYPE_CHECKING:
     from bench.cache.store import Entry
 
 SUMMARY = "list, verify or prune the cache: bench cache list"
-EPILOG = """Every entry can be computed again. The cache is in the platform's folder for caches
-(on Linux ~/.cache/feature-privacy-bench), or in the folder that the environment variable FEATURE_PRIVACY_CACHE names.
+EPILOG = """The cache is a folder: the value of the environment variable FEATURE_PRIVACY_CACHE, or else the platform's folder
+for caches (on Linux ~/.cache/feature-privacy-bench). A removed entry is computed again when it is needed.
 
 examples:
   bench cache list
@@ -31,8 +31,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "what", nargs="?", metavar="list|verify|prune", help="list entries, check all checksums, or remove entries"
     )
     parser.add_argument("--kind", metavar="KIND", help="only entries of this kind, such as features")
-    parser.add_argument("--older-than", type=parse_number, metavar="DAYS", help="only entries that were not used for so long")
-    parser.add_argument("--larger-than", type=parse_size, metavar="SIZE", help="only larger entries; a size such as 20MB")
+    parser.add_argument("--older-than", type=parse_number, metavar="DAYS", help="only entries that were not used for DAYS days")
+    parser.add_argument("--larger-than", type=parse_size, metavar="SIZE", help="only entries larger than SIZE, such as 20MB")
     parser.add_argument("--damaged", action="store_true", help="only damaged or unfinished entries")
 
 
@@ -107,7 +107,7 @@ def _verify(entries: list[Entry]) -> int:
 
 def _prune(args: argparse.Namespace, entries: list[Entry]) -> int:
     if not args.damaged and all(value is None for value in (args.kind, args.older_than, args.larger_than)):
-        raise UserError("give what to remove: --kind, --older-than, --larger-than or --damaged (--older-than 0 removes all)")
+        raise UserError("select the entries: --kind, --older-than, --larger-than or --damaged (--older-than 0 removes all)")
     for entry in entries:
         entry.remove()
     print(f"removed {len(entries)} entries and freed {_format_total(entries)}")

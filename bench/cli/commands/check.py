@@ -7,9 +7,9 @@ from pathlib import Path
 
 from bench.cli.terminal import DONE, FAILED, REGRESSION, print_rich
 
-SUMMARY = "compare results with a baseline, experiment by experiment: better, worse, or the same"
-EPILOG = """Experiments are matched by configuration and inputs, for any seed. The tolerance comes from the spread between seeds,
-or from the bootstrap over samples if there is one seed; see docs/formats.md.
+SUMMARY = "compare results with a baseline, experiment by experiment: better, worse, or unchanged"
+EPILOG = """Experiments are matched by configuration and inputs; seeds may differ. The tolerance comes from the spread between
+seeds, or with one seed from the bootstrap over samples; see docs/formats.md.
 
 exit status: 0 nothing is worse; 1 a part of the baseline is missing; 2 invalid arguments;
 3 privacy or utility is worse than tolerated, or an attack is weaker
@@ -23,12 +23,14 @@ REQUIRED = ("baseline", "results")
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--baseline", type=Path, metavar="FILE", help="records of a reference run; or ratios of speed, .json")
-    parser.add_argument("--results", type=Path, metavar="DIR", help="a folder of bench run; or a file of pytest-benchmark, .json")
+    parser.add_argument("--baseline", type=Path, metavar="FILE", help="records of a reference run, or speed ratios (.json)")
     parser.add_argument(
-        "--format", choices=("text", "github"), default="text", help="a table, or annotations for GitHub (default: %(default)s)"
+        "--results", type=Path, metavar="DIR", help="a folder of bench run, or a file of pytest-benchmark (.json)"
     )
-    parser.add_argument("--all", action="store_true", help="also show what is the same")
+    parser.add_argument(
+        "--format", choices=("text", "github"), default="text", help="output: table, or GitHub annotations (default: %(default)s)"
+    )
+    parser.add_argument("--all", action="store_true", help="also show unchanged experiments")
 
 
 def execute(args: argparse.Namespace) -> int:

@@ -9,7 +9,7 @@ import sys
 from bench.cli.terminal import DONE, parse_whole, print_rich
 
 SUMMARY = "measure this machine and estimate the cost of a service: operations, bytes and time, per query and per day"
-EPILOG = """Times are those of one core of this machine; a phone differs. The measurement takes some seconds.
+EPILOG = """Times are measured on one core of this machine; a phone differs. The measurement takes some seconds.
 
 examples:
   bench cost
@@ -30,16 +30,20 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--queries", type=parse_positive, default=1_000_000, metavar="N", help="queries per day (default: %(default)s)"
     )
     parser.add_argument(
-        "--keypoints", type=parse_positive, default=1000, metavar="N", help="keypoints of a photograph (default: %(default)s)"
+        "--keypoints", type=parse_positive, default=1000, metavar="N", help="keypoints per photograph (default: %(default)s)"
     )
     parser.add_argument(
-        "--words", type=parse_positive, default=256_000, metavar="K", help="words of the dictionary (default: %(default)s)"
+        "--words",
+        type=parse_positive,
+        default=256_000,
+        metavar="K",
+        help="words in the dictionary (default: %(default)s)",
     )
     parser.add_argument(
-        "--subset-size", type=parse_positive, default=2, metavar="M", help="words sent for each keypoint (default: %(default)s)"
+        "--subset-size", type=parse_positive, default=2, metavar="M", help="words released per keypoint (default: %(default)s)"
     )
     parser.add_argument(
-        "--references", type=parse_positive, default=20, metavar="R", help="reference images to match (default: %(default)s)"
+        "--references", type=parse_positive, default=20, metavar="R", help="reference images per query (default: %(default)s)"
     )
     parser.add_argument("--markdown", action="store_true", help="print the table as Markdown")
 

@@ -16,8 +16,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--layout", metavar="aachen|colmap", help="the layout of the folder")
     parser.add_argument("--out", type=Path, metavar="DIR", help="a new folder")
     parser.add_argument("--views", type=parse_whole, metavar="N", help="number of reference images; sets the field of that name")
-    parser.add_argument("--queries", type=parse_whole, metavar="N", help="number of queries; likewise")
-    parser.add_argument("--seed", type=parse_whole, metavar="N", help="seed; likewise")
+    parser.add_argument("--queries", type=parse_whole, metavar="N", help="number of queries; sets the field of that name")
+    parser.add_argument("--seed", type=parse_whole, metavar="N", help="seed of the dataset; sets the field of that name")
 
 
 def execute(args: argparse.Namespace) -> int:

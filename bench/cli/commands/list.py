@@ -7,7 +7,7 @@ import argparse
 from bench.cli.terminal import DONE, print_rich
 from bench.core.errors import unknown_name
 
-SUMMARY = "list plugins with their fields, and which attack applies to which defense"
+SUMMARY = "list plugins with their fields, and the applicability of each attack to each defense"
 REQUIRED = ()
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from bench.cli.terminal import DONE
 
 SUMMARY = "write a small package with a new plugin and a passing test of its contract"
-EPILOG = """The package works as written. Change it to your needs.
+EPILOG = """The package runs without changes. Replace its example by your own code.
 
 examples:
   bench new defense my-defense
@@ -20,7 +20,7 @@ REQUIRED = ("kind", "name")
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("kind", nargs="?", metavar="KIND", help="defense, attack, metric, task, extractor or dataset")
-    parser.add_argument("name", nargs="?", metavar="NAME", help="small letters, digits and -")
+    parser.add_argument("name", nargs="?", metavar="NAME", help="lower-case letters, digits and -")
     parser.add_argument("--out", type=Path, metavar="DIR", help="a new folder (default: the name of the plugin)")
 
 

@@ -1,4 +1,4 @@
-"""`bench reproduce`: the paper's tables and figures beside our results."""
+"""`bench reproduce`: our results beside the tables and figures of the paper."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from bench.cli.terminal import DONE, FAILED, add_extractor, add_seed, parse_whole, print_rich, print_status
 
 SUMMARY = "reproduce a table of the paper, or its figures, beside the published values"
-EPILOG = """Tables have intervals over the photographs, and a verdict on each claim of the paper.
+EPILOG = """Each table shows intervals over the photographs, and a verdict on each claim of the paper.
 
 examples:
   bench reproduce table1
@@ -25,19 +25,21 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--profile", metavar="NAME", default="cpu", help="smoke, cpu or paper: the size of the experiment (default: %(default)s)"
     )
     parser.add_argument("--images", type=Path, metavar="DIR", help="a folder of photographs (default: the built-in ones)")
-    parser.add_argument("--dataset", metavar="SPEC", help="the scene of a table about localization (default: a gallery)")
-    parser.add_argument("--workers", type=parse_whole, metavar="N", help="processes, for such tables (default: one per core)")
+    parser.add_argument("--dataset", metavar="SPEC", help="the scene, for tables about localization (default: a gallery)")
+    parser.add_argument(
+        "--workers", type=parse_whole, metavar="N", help="worker processes, for tables about localization (default: one per core)"
+    )
     add_extractor(parser, None, "the table's own")
     add_seed(parser)
     parser.add_argument(
         "--out", type=Path, metavar="DIR", help="folder for the results; resumed if it exists (default: a folder in runs/)"
     )
-    parser.add_argument("--dictionary", metavar="FILE", help="K of LDP-Feat (default: the shipped one)")
-    parser.add_argument("--database", metavar="FILE", help="W of affine lifting (default: the shipped one)")
-    parser.add_argument("--public-database", metavar="FILE", help="the attacker's Z (default: the shipped one)")
+    parser.add_argument("--dictionary", metavar="FILE", help="dictionary K of LDP-Feat (default: the shipped one)")
+    parser.add_argument("--database", metavar="FILE", help="database W of affine lifting (default: the shipped one)")
+    parser.add_argument("--public-database", metavar="FILE", help="database Z of the attacker (default: the shipped one)")
     for network, defense in (("raw", "none"), ("affine", "affine"), ("ldp", "ldp")):
         parser.add_argument(
-            f"--{network}-network", metavar="FILE", help=f"weights trained for `{defense}` (default: the shipped ones)"
+            f"--{network}-network", metavar="FILE", help=f"network trained for `{defense}` (default: the shipped one)"
         )
 
 
@@ -56,6 +58,7 @@ def execute(args: argparse.Namespace) -> int:
         out=args.out,
         workers=args.workers,
         materials=materials,
+        command=args.command,
     )
     print_rich(*done.output)
     print_status(DONE, f"written to {done.out}")

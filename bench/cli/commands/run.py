@@ -1,4 +1,4 @@
-"""`bench run`: evaluate defenses against attacks, or by a task of the server."""
+"""`bench run`: evaluate defenses by attacks on them, or by a task of the server."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from bench.runner.records import Record
     from bench.task_api import Task
 
-SUMMARY = "run defenses against attacks on photographs, and report how much is recovered"
+SUMMARY = "run attacks on the releases of defenses, or a task of the server, and report the metrics"
 EPILOG = """Write a plugin as name:field=value,field=value; `bench list` shows names and fields.
-Repeated options form a grid.
+Every given defense is combined with every given attack.
 
 examples:
   bench run --defense ldp --attack dia
@@ -31,14 +31,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--defense", action="append", metavar="SPEC", help="a defense; may be repeated")
     parser.add_argument("--attack", action="append", metavar="SPEC", help="an attack; may be repeated")
     parser.add_argument(
-        "--task", metavar="SPEC", default="reconstruction", help="the task that evaluates a release (default: %(default)s)"
+        "--task", metavar="SPEC", default="reconstruction", help="the task that evaluates the releases (default: %(default)s)"
     )
     parser.add_argument(
         "--metric",
         action="append",
         default=[],
         metavar="SPEC",
-        help="a metric that needs a file; all others are measured anyway",
+        help="a metric that needs a file; all other metrics are always computed",
     )
     add_extractor(parser)
     parser.add_argument("--images", type=Path, metavar="DIR", help="a folder of photographs (default: seven built-in ones)")
@@ -81,7 +81,7 @@ def execute(args: argparse.Namespace) -> int:
     records = watch.execute_with_progress(
         [plan], out, engine, f"{task.name()}: {len(plan.samples)} samples, {len(plan.experiments)} pairs"
     )
-    run_report.write(records, out)
+    run_report.write(records, out, args.command)
     _print_records(records) if args.json else watch.print_tables(records)
     for line in localization_results.write(records, out):
         print_status(DONE, line)
@@ -106,7 +106,7 @@ def _read_metric(text: str) -> Metric:
 
     metric = spec.read(text, discovery.METRIC)
     if not fields.list_required(type(metric)):
-        raise UserError(f"--metric {metric.name()}: not needed; all metrics that need no file are measured anyway")
+        raise UserError(f"--metric {metric.name()}: remove it; metrics that need no file are always computed")
     return metric
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from bench.cli.terminal import DONE, print_rich
 from bench.core.errors import UserError
 
-SUMMARY = "show how much of a run or suite is done, running, failed, not applicable or missing"
+SUMMARY = "show the progress of a run or suite: numbers of done, running, failed, missing and inapplicable samples"
 EPILOG = """examples:
   bench status                      # every run in runs/
   bench status paper-table-1
@@ -18,7 +18,7 @@ REQUIRED = ()
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("suite", nargs="?", metavar="SUITE", help="a suite that bench sweep ran without --out")
+    parser.add_argument("suite", nargs="?", metavar="SUITE", help="a suite that was run by bench sweep without --out")
     parser.add_argument("--results", type=Path, metavar="DIR", help="a folder of bench run, sweep or reproduce")
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from bench.cli.terminal import DONE, FAILED, add_seed, parse_whole, print_status
 
 SUMMARY = "check submitted records: schema, hashes, ranges, applicability and duplicates; recompute a sample of them"
-EPILOG = """A record is recomputed with its attack in a process that never holds the secret. Its plugins must be installed.
-Every fault is a line on stdout that begins with the line number in the file.
+EPILOG = """The attack of a recomputed record runs in a process that never holds the secret. Its plugins must be installed.
+Each fault is one line on stdout, which begins with the line number in the file.
 
 exit status: 0 no fault; 1 a fault; 2 invalid arguments
 
@@ -29,7 +29,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="FILE",
-        help="a dictionary or network; may be repeated",
+        help="a dictionary or network that the records use; may be repeated",
     )
     parser.add_argument(
         "--sample", type=parse_whole, default=3, metavar="N", help="number of records to recompute (default: %(default)s)"

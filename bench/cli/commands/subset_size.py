@@ -7,23 +7,23 @@ from pathlib import Path
 
 from bench.cli.terminal import DONE, parse_number, parse_whole, parse_wholes, print_rich
 
-SUMMARY = "compare subset sizes for a dictionary and an epsilon: information, and success of the server"
+SUMMARY = "compare subset sizes for a dictionary and an epsilon: information, and success of localization"
 REQUIRED = ("epsilon",)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--epsilon", type=parse_number, metavar="E", help="epsilon of a descriptor")
+    parser.add_argument("--epsilon", type=parse_number, metavar="E", help="epsilon of each descriptor")
     parser.add_argument(
-        "--words", type=parse_whole, metavar="K", help="words of the dictionary (default: those of the shipped one)"
+        "--words", type=parse_whole, metavar="K", help="number of words of the dictionary (default: that of the shipped one)"
     )
     parser.add_argument(
         "--sizes",
         type=parse_wholes,
         metavar="M,M,...",
-        help="subset sizes to compare (default: powers of 2, and the optima of theory)",
+        help="subset sizes to compare (default: 1, 2, 4, 8, 16 and the two optima of theory)",
     )
     parser.add_argument(
-        "--keypoints", type=parse_whole, default=1000, metavar="N", help="keypoints of a query (default: %(default)s)"
+        "--keypoints", type=parse_whole, default=1000, metavar="N", help="keypoints per query (default: %(default)s)"
     )
     parser.add_argument(
         "--repeated",
@@ -33,14 +33,18 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="fraction of keypoints whose word occurs at their point in the retrieved references (default: %(default)s)",
     )
     parser.add_argument(
-        "--points", type=parse_whole, default=5000, metavar="R", help="points of these references (default: %(default)s)"
+        "--points",
+        type=parse_whole,
+        default=5000,
+        metavar="R",
+        help="3D points in these references (default: %(default)s)",
     )
     parser.add_argument("--trials", type=parse_whole, default=30_000, metavar="T", help="trials of RANSAC (default: %(default)s)")
     parser.add_argument(
         "--results",
         type=Path,
         metavar="DIR",
-        help="results of localization: shows the recall by day, and uses the measured fractions of undefended queries",
+        help="results of localization; shows their recall by day, and uses the repeated fractions measured without a guarantee",
     )
 
 

@@ -9,7 +9,7 @@ from bench.cli.terminal import DONE, FAILED, add_engine, print_status
 from bench.core.errors import UserError
 
 SUMMARY = "run a suite of experiments, on one machine or many; finished records are not computed again"
-EPILOG = """A suite is a name (smoke, paper-table-1, ..., full), or your own: module:NAME or path/to/file.py:NAME.
+EPILOG = """SUITE is a name (smoke, paper-table-1, ..., full), or your own suite: module:NAME or path/to/file.py:NAME.
 
 examples:
   bench sweep smoke
@@ -22,7 +22,7 @@ REQUIRED = ()
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("suite", nargs="?", metavar="SUITE", help="the suite; without it, all suites are listed")
-    parser.add_argument("--images", type=Path, metavar="DIR", help="a folder of photographs (default: that of the suite)")
+    parser.add_argument("--images", type=Path, metavar="DIR", help="a folder of photographs (default: those of the suite)")
     add_engine(parser)
     parser.add_argument(
         "--out", type=Path, metavar="DIR", help="folder for the results; resumed if it exists (default: a folder in runs/)"
@@ -50,7 +50,7 @@ def execute(args: argparse.Namespace) -> int:
     out = args.out or suite.choose_folder(args.suite)
     pairs = sum(len(plan.experiments) for plan in plans)
     records = watch.execute_with_progress(plans, out, engine, f"{args.suite}: {pairs} pairs")
-    run_report.write(records, out)
+    run_report.write(records, out, args.command)
     watch.print_tables(records)
     print_status(DONE, f"written to {out}")
     return FAILED if any(record["status"] == "failed" for record in records) else DONE

@@ -1,4 +1,4 @@
-"""`bench train`: trains an attacker's inversion network for the releases of a defense."""
+"""`bench train`: train an attacker's inversion network for the releases of a defense."""
 
 from __future__ import annotations
 
@@ -13,36 +13,43 @@ REQUIRED = ("defense", "images", "out")
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--defense", metavar="SPEC", help="fixes the given fields; the network learns all others")
+    parser.add_argument("--defense", metavar="SPEC", help="the defense; fields not given are trained over their supported range")
     parser.add_argument("--images", type=Path, metavar="DIR", help="a folder of photographs")
     parser.add_argument("--out", type=Path, metavar="FILE", help="the network's weights, a safetensors file")
     parser.add_argument(
         "--validation",
         type=Path,
         metavar="DIR|LIST",
-        help="a folder, or a file of names in --images to hold out (default: every 20th)",
+        help="a folder of other photographs, or a text file with names of photographs in --images (default: every 20th)",
     )
     parser.add_argument(
         "--crossfit",
         action="append",
         default=[],
         metavar="FILE",
-        help="a dictionary for photographs that the defense's own was built from; may be repeated",
+        help="a dictionary for training photographs that are part of the defense's own dictionary; may be repeated",
     )
     parser.add_argument(
         "--encoding",
         choices=("invariant", "released", "positions"),
         default="invariant",
-        help="input of the network: the release without random order or basis, as it is, or positions alone",
+        help="network input: release without random order or basis, unchanged release, or positions (default: %(default)s)",
     )
-    parser.add_argument("--profile", choices=("cpu", "paper"), default="cpu", help="sizes that no other option sets")
-    parser.add_argument("--devices", type=parse_whole, default=1, metavar="N", help="GPUs or CPU processes that share each batch")
+    parser.add_argument(
+        "--profile",
+        choices=("cpu", "paper"),
+        default="cpu",
+        help="network size and schedule, unless other options set them; paper takes days on a GPU (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--devices", type=parse_whole, default=1, metavar="N", help="GPUs or CPU processes that divide each batch"
+    )
     parser.add_argument("--widths", type=parse_wholes, metavar="N,N,...", help="channels of the network's levels")
     parser.add_argument(
         "--initial-checkpoint",
         type=Path,
         metavar="FILE",
-        help="weights of a network for such releases or for raw descriptors, from which the training begins",
+        help="initial weights: those of a network for the same kind of releases, or for raw descriptors",
     )
     parser.add_argument("--rate", type=float, metavar="R", help="peak learning rate")
     parser.add_argument("--steps", type=parse_whole, metavar="N", help="training steps")

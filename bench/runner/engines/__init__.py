@@ -9,12 +9,12 @@ ENGINES = ("processes", "dask")
 
 
 def choose_engine(workers: int = 1, kind: str = ENGINES[0], scheduler: str | None = None) -> Engine:
-    """Return the engine of that kind: `workers` processes of this machine, or the workers of a dask scheduler.
+    """Return an engine: `workers` processes of this machine, or the workers of a dask scheduler.
 
     Raises
     ------
     UserError
-        if there is no such kind, or it lacks what it needs.
+        if the kind is unknown, or `workers` or `scheduler` does not suit it.
     """
     if kind not in ENGINES:
         raise unknown_name("engine", kind, ENGINES)
@@ -22,10 +22,10 @@ def choose_engine(workers: int = 1, kind: str = ENGINES[0], scheduler: str | Non
         from bench.runner.engines.cluster import Cluster
 
         if scheduler is None:
-            raise UserError("--scheduler is missing: --engine dask needs the address of one, such as tcp://127.0.0.1:8786")
+            raise UserError("--scheduler is missing: --engine dask needs a scheduler's address, such as tcp://127.0.0.1:8786")
         return Cluster(scheduler)
     if scheduler is not None:
-        raise UserError("--scheduler is for --engine dask")
+        raise UserError("--scheduler requires --engine dask")
     if workers < 1:
         raise UserError(f"--workers must be at least 1, got {workers}")
     if workers == 1:

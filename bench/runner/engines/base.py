@@ -1,6 +1,6 @@
-"""The interface of engines, and the engine that is this process.
+"""The interface of engines, and the engine that executes jobs in this process.
 
-An engine takes jobs as it has room for them and yields their results, in any order. It writes no file.
+An engine takes jobs when a worker is free and yields their results in any order. It writes no file.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ class Job:
 
     @property
     def name(self) -> str:
-        """Its task and a hash of all that its record depends on."""
+        """Name of the task, and a hash of all inputs of the record."""
         return f"{self.plan.task.name()}-{short_hash(self.key)}"
 
 
 @dataclass(frozen=True, kw_only=True)
 class JobMessage:
-    """A job as it is sent to another process, which builds the same plan from the configuration."""
+    """A job as a message to another process, which builds the same plan from the configuration."""
 
     configuration: bytes  # pickled
     key: tuple[str, str]
-    threads: int  # to compute with
+    threads: int  # number of threads of the computation
 
 
 class Engine(ABC):
@@ -54,12 +54,12 @@ class Engine(ABC):
 
     @abstractmethod
     def describe(self, plugins: Iterable[object]) -> dict[str, Any]:
-        """Return the environment that the jobs will run in, as records hold it.
+        """Return the environment that executes the jobs, in the form of records.
 
         Raises
         ------
         UserError
-            if there is none, or more than one.
+            if there is no worker, or the environments of the workers differ.
         """
 
     @abstractmethod
@@ -69,12 +69,12 @@ class Engine(ABC):
         Raises
         ------
         UserError
-            if the engine cannot go on.
+            if the engine cannot continue.
         """
 
 
 class InProcess(Engine):
-    """This process, one job after the other."""
+    """Executes jobs in this process, in order."""
 
     name = "this process"
 
@@ -102,7 +102,7 @@ def write_message(job: Job, threads: int) -> JobMessage:
 def run_as_completed(
     submit: Callable[[Job], Future[Result]], room: Callable[[], int], jobs: Iterator[Job]
 ) -> Iterator[tuple[Job, Future[Result]]]:
-    """Submit jobs while there is room for more, and yield each with its result as soon as there is one."""
+    """Submit jobs while fewer than `room()` are waiting, and yield each job with its future when it is done."""
     waiting: dict[Future[Result], Job] = {}
     try:
         for job in jobs:

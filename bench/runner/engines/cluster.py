@@ -1,4 +1,4 @@
-"""Workers on many machines, under a scheduler of dask.distributed. `docs/sweeps.md` says how to start them."""
+"""Engine: workers on many machines, under a scheduler of dask.distributed. `docs/running.md` explains how to start them."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from bench.runner.trial import Result, build_record
 if TYPE_CHECKING:
     from distributed import Client
 
-AHEAD = 2  # jobs for each worker: one that runs, and one that waits
-THREADS = 1  # of a worker: there is one for each core
-PATIENCE = 60.0  # seconds until the scheduler and a first worker must have answered
+AHEAD = 2  # submitted jobs per worker: one is running, one is waiting
+THREADS = 1  # per worker, as there is one worker per core
+PATIENCE = 60.0  # seconds to wait for the scheduler and a first worker
 
 
 class Cluster(Engine):
-    """The workers of a scheduler. A job is a dask task, keyed by the job's hash; other workers execute the jobs of a lost one."""
+    """Executes jobs by the workers of a scheduler. Each job is a dask task; if a worker is lost, others execute its jobs."""
 
     name = "dask"
 
@@ -33,10 +33,10 @@ class Cluster(Engine):
             try:
                 client.wait_for_workers(1, timeout=PATIENCE)
             except TimeoutError:
-                raise UserError(f"--scheduler {self._scheduler}: it has no workers") from None
+                raise UserError(f"--scheduler {self._scheduler}: the scheduler has no workers; start some") from None
             several = [address for address, count in client.nthreads().items() if count != 1]
             if several:
-                raise UserError(f"worker {several[0]} does several jobs at once; start workers with --nthreads 1")
+                raise UserError(f"worker {several[0]} executes several jobs at a time; start workers with --nthreads 1")
             environments = client.run(worker.describe_environment, list(plugins), THREADS)
         (first, reference), *rest = environments.items()
         for address, other in rest:
@@ -58,9 +58,9 @@ class Cluster(Engine):
                 try:
                     yield future.result()
                 except CancelledError:
-                    raise UserError(f"--scheduler {self._scheduler}: the scheduler was lost; run again to go on") from None
+                    raise UserError(f"--scheduler {self._scheduler}: lost the connection; run again to continue") from None
                 except KilledWorker:
-                    reason = "every worker that began this ended, perhaps for want of memory"
+                    reason = "every worker that started this job ended, perhaps for lack of memory"
                     yield Result(record=build_record(job.experiment, job.sample, status="failed", reason=reason))
 
     def _client(self) -> Client:
@@ -68,8 +68,8 @@ class Cluster(Engine):
             from distributed import Client
         except ImportError:
             raise UserError("--engine dask needs distributed: pip install 'feature-privacy-bench[dask]'") from None
-        logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # our errors report what matters
+        logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # our own errors are enough
         try:
             return Client(self._scheduler, timeout=PATIENCE, set_as_default=False)
         except (OSError, ValueError) as error:
-            raise UserError(f"--scheduler {self._scheduler}: no scheduler answers there ({error})") from None
+            raise UserError(f"--scheduler {self._scheduler}: no scheduler answers at this address ({error})") from None

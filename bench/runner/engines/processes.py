@@ -1,4 +1,4 @@
-"""Processes on one machine that share its cores."""
+"""Engine: several processes on one machine, each with a part of its cores."""
 
 from __future__ import annotations
 
@@ -16,31 +16,31 @@ from bench.runner.engines.base import Engine, Job, run_as_completed, write_messa
 from bench.runner.plan import Plan
 from bench.runner.trial import Result
 
-AHEAD = 2  # jobs for each process: one that runs, and one that waits
+AHEAD = 2  # submitted jobs per process: one is running, one is waiting
 
 
 class Processes(Engine):
-    """Several processes, each with its part of the cores. Records hold the number of threads."""
+    """Executes jobs in several processes, each with an equal number of threads, which records hold."""
 
     name = "processes"
 
     def __init__(self, workers: int) -> None:
         self._workers = workers
         self._threads = max(1, threads.count_cores() // workers)
-        threads.limit_threads(self._threads)  # in this process too, and so in those that it starts
+        threads.limit_threads(self._threads)  # in this process and in its child processes
 
     def describe(self, plugins: Iterable[object]) -> dict[str, Any]:
         return environment.describe(plugins)
 
     def __call__(self, jobs: Iterator[Job]) -> Iterator[Result]:
-        # Processes are spawned: a fork of one that has computed with several threads can hang.
+        # Processes are spawned: a fork can hang after a computation with several threads.
         executor = ProcessPoolExecutor(self._workers, multiprocessing.get_context("spawn"), initializer=_start_worker)
         plans: set[Plan] = set()
 
         def submit(job: Job) -> Future[Result]:
             index = job.plan.public.scene_index
             if index is not None and job.plan.needs_map and job.plan not in plans:
-                _ = index.map  # built once, before each process reads it
+                _ = index.map  # build it once, before the processes read it
             plans.add(job.plan)
             return executor.submit(worker.execute_job, write_message(job, self._threads))
 
@@ -48,10 +48,10 @@ class Processes(Engine):
             for _, future in run_as_completed(submit, lambda: AHEAD * self._workers, jobs):
                 yield future.result()
         except BrokenProcessPool:
-            raise UserError("a worker process was ended from outside, perhaps for want of memory; run again to go on") from None
+            raise UserError("a worker process was killed, perhaps for lack of memory; run again to continue") from None
         finally:
             executor.shutdown(wait=False, cancel_futures=True)
 
 
 def _start_worker() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C, which a terminal sends to all, ends it without a traceback
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # a terminal sends Ctrl-C to all processes; this one ends without a traceback

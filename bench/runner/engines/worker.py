@@ -1,4 +1,4 @@
-"""Functions that run in a process that executes jobs of another."""
+"""Functions of worker processes, which execute the jobs of another process."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from bench.runner.plan import build_plan
 from bench.runner.trial import Result, TrialRunner
 
 _LAST: list[TrialRunner] = []  # the runner whose last sample is in memory
-PLANS = 2  # plans in memory: jobs come plan by plan, but one that was lost may come late
+PLANS = 2  # plans in memory: jobs arrive plan by plan, but a repeated job may arrive late
 
 
 def execute_job(message: JobMessage) -> Result:
-    """Execute the job.
+    """Execute the job, and return its result.
 
     Raises
     ------
     UserError
-        if this process would execute another job: its source, libraries or photographs are not those of the sender.
+        if source, libraries or photographs differ from those of the sender.
     """
     threads.limit_threads(message.threads)
     runner = _build_runner(message.configuration)
@@ -36,13 +36,13 @@ def execute_job(message: JobMessage) -> Result:
         if experiment.metadata["run_hash"] == run_hash:
             return runner.execute(experiment, next(sample for sample in runner.plan.samples if sample.name == name))
     raise UserError(
-        "a worker has other source, libraries or files than there were when the run began: it would make other records; "
+        "a worker has other source, libraries or files than the run at its start; "
         "start all workers in one environment and folder, and run again"
     )
 
 
 def describe_environment(plugins: Iterable[object], count: int) -> dict[str, Any]:
-    """Return the environment of this process, computing with `count` threads."""
+    """Return the environment of this process with `count` threads."""
     threads.limit_threads(count)
     return environment.describe(plugins)
 

@@ -1,4 +1,4 @@
-"""Reconstructions from subspaces: rows are photographs, columns attacks; one figure per dimension."""
+"""Reconstructions from subspaces, with one row per photograph, one column per attack and one figure per dimension."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def draw_figures(data: FigureData) -> Iterator[tuple[str, Figure]]:
                 *(data.build_panel(table1.format_name(attack, dim), name, title) for attack, title in TITLES.items()),
             ]
             panels += row if number == 0 else [Panel(panel.pixels, "", panel.caption) for panel in row]
-        yield f"dim{dim}", draw(panels, f"What attacks recover from affine subspaces of dimension {dim}", columns=len(TITLES) + 2)
+        yield f"dim{dim}", draw(panels, f"Reconstructions from affine subspaces of dimension {dim}", columns=len(TITLES) + 2)
 
 
 DRAWING = Drawing(name="attacks", draw=draw_figures, build_rows=table1.build_rows)

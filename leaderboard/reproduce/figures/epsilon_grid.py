@@ -1,4 +1,4 @@
-"""Reconstructions by DIA from LDP-Feat: rows are ε, columns m; one figure per photograph."""
+"""Reconstructions by DIA from LDP-Feat, with one row per ε, one column per m and one figure per photograph."""
 
 from __future__ import annotations
 

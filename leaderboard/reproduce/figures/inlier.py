@@ -1,4 +1,4 @@
-"""The inlier attack: reconstructions from the inliers of localized queries. They show the scene, not the people before it."""
+"""Reconstructions by the inlier attack from localized queries. They show the scene and not the people in front of it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PARTS = {"SSIM background": "ssim_background", "foreground": "ssim_foreground"}
-LDP = ("256000", "12", 2)  # |K|, ε, m of the paper; nearly every query is localized
+LDP = ("256000", "12", 2)  # the paper's |K|, ε and m; nearly all queries are localized
 
 
 def build_rows(setting: Setting) -> tuple[Row, ...]:

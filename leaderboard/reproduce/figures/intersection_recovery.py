@@ -1,8 +1,8 @@
-"""The intersection attack (in no paper) over the number of observed photographs: its recovery, and the coverage of its words.
+"""The intersection attack (not in the paper) over the number of observed photographs: its recovery, and the coverage of words.
 
-It knows no database and reconstructs one from intersections of subspaces. Its recovery is limited by the coverage: the fraction
-of the photograph's words that its releases contain. The owner, who knows these words, measures the coverage; the attack has its
-own estimate. The database attack, which knows all words, is the limit.
+The attack has no database and reconstructs one from intersections of subspaces. The coverage limits its recovery: it is the
+fraction of the photograph's words that the observed releases contain. The task `collisions` measures it with the true words,
+while the attack has its own estimate. The upper limit is the database attack, which has all words.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from leaderboard.reproduce.tables import table1
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# About as many photographs contain a given word with 95% probability. Subspaces with fewer words need more photographs.
+# At least one of about so many photographs contains a given word with 95% probability. Subspaces with fewer words need more.
 MAX_RELEASES = {2: 800, 4: 400, 8: 200, 16: 100}
 HALVINGS = 5
 
@@ -37,7 +37,7 @@ def build_rows(setting: Setting) -> tuple[Row, ...]:
     rows = []
     for dim in table1.DIMS:
         for count in list_counts(setting, dim):
-            configuration = {"others": count, "coverage": 1.0}  # 1.0: all of them are used
+            configuration = {"others": count, "coverage": 1.0}  # 1.0: all releases are used
             experiments = (
                 (
                     format_attack_name(dim, count),
@@ -67,7 +67,7 @@ def draw_figures(data: FigureData) -> Iterator[tuple[str, Figure]]:
     figure = Figure(figsize=(9.6, 3.9), layout="constrained", dpi=120)
     photographs = len(data.evaluation_set.photographs)
     average = f"mean over {photographs} photograph{'s' * (photographs > 1)}"
-    figure.suptitle(f"The intersection attack, which knows no database; stars: the database attack; {average}", fontsize=9)
+    figure.suptitle(f"The intersection attack, without a database. Stars: the database attack. Values: {average}", fontsize=9)
     recovery_axes, ssim_axes = figure.subplots(1, 2)
     for number, dim in enumerate(table1.DIMS):
         counts, color = list_counts(data.setting, dim), f"C{number}"

@@ -1,8 +1,8 @@
-"""Affine and LDP-Feat reconstructions at matched recall: rows are photographs; one figure per dimension of the subspaces.
+"""Reconstructions from affine subspaces and LDP-Feat at matched recall: one row per photograph, one figure per dimension.
 
 The privacy of two defenses is compared at equal utility. So the queries of a gallery are localized under each defense, and each
-dimension is paired with the ε of nearest recall. Both recalls stand above the pictures, for the nearest may still differ. The
-gallery's |K| differs from the photographs', at the same probability of the true word (`scale.py`).
+dimension is paired with the ε of nearest recall. Both recalls are printed above the images, since they may still differ. The
+gallery's |K| differs from the photographs' at the same probability of the true word (`scale.py`).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ ATTACKS = {"database": "database", "dia": "DIA"}
 
 
 def build_rows(setting: Setting) -> tuple[Row, ...]:
-    """Return the rows of Tables 1 and 4 that are drawn."""
+    """Return the rows of Tables 1 and 4 that the figures show."""
     affine_rows = [row for row in table1.build_rows(setting) if row.labels["attack"] in ATTACKS]
     ldp_names = {table4.format_name(WORDS, epsilon, SUBSET) for epsilon in table4.EPSILONS}
     return (*affine_rows, *(row for row in table4.build_rows(setting) if row.name in ldp_names))
@@ -68,7 +68,7 @@ def measure_recalls(data: FigureData) -> dict[str, float]:
 
 
 def find_nearest_epsilon(recall: float, recalls: Mapping[int, float]) -> int:
-    """Return the ε whose recall is nearest; the smallest if several are."""
+    """Return the ε with the nearest recall; of several, the smallest."""
     return min(sorted(recalls), key=lambda epsilon: abs(recalls[epsilon] - recall))
 
 
@@ -93,7 +93,7 @@ def draw_figures(data: FigureData) -> Iterator[tuple[str, Figure]]:
                 ),
             ]
             panels += row if number == 0 else [Panel(panel.pixels, "", panel.caption) for panel in row]
-        heading = f"Affine subspaces and LDP-Feat at the recall that is nearest (of queries within 0.25 m and 2°), dim {dim}"
+        heading = f"Affine subspaces and LDP-Feat at the nearest recall (queries within 0.25 m and 2°), dim {dim}"
         yield f"dim{dim}", draw(panels, heading, columns=len(ATTACKS) + 2)
 
 

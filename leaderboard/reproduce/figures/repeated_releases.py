@@ -1,4 +1,4 @@
-"""Repeated releases of the same features (in no paper): the probability of finding the true word, beside the bound of T ε."""
+"""Repeated releases of the same features (not in the paper): the probability of finding the true word, and the bound of T ε."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from leaderboard.reproduce.drawing import Drawing, FigureData
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-WORDS, SUBSET, EPSILONS = 256_000, 2, (10, 12)  # the paper's operating point for localization, and the next
+WORDS, SUBSET, EPSILONS = 256_000, 2, (10, 12)  # the paper's operating point for localization, and the next ε
 RELEASES = 8
 
 

@@ -1,8 +1,9 @@
-"""The database attack in three dimensions (the paper's toy example). The plugins compute everything that is drawn.
+"""The database attack in three dimensions, as in the paper's toy example. The plugins compute everything that is drawn.
 
 Words lie along a curve on the sphere, as real descriptors lie on a manifold of few dimensions. One descriptor is lifted to a
-plane through it and one word; the attacker knows the words. The seed shows what the attack relies on: the plane intersects the
-curve nowhere else. With other seeds it does, since three dimensions leave a plane little room, and the estimate is wrong.
+plane through it and one word. The attacker knows the words. The attack assumes that the plane intersects the curve nowhere
+else, which is so for this seed. With other seeds the plane intersects it again, since three dimensions are few, and the
+estimate is wrong.
 """
 
 from __future__ import annotations
@@ -36,9 +37,9 @@ Doubles = NDArray[np.float64]
 
 SEED = 11
 WORDS = 160
-SPREAD = 0.02  # of the words around the curve
+SPREAD = 0.02  # standard deviation of the words around the curve
 NEIGHBOURS, ESTIMATORS = 10, 4  # |V|, |U|
-NEAR = 0.1  # words closer to the plane than this are drawn in it
+NEAR = 0.1  # words with a smaller distance to the plane are drawn in it
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -50,13 +51,13 @@ class Toy:
     release: Subspaces
     adversarial: int  # the word a_1
     near: Indices  # (|V|,) the words next nearest to the plane
-    estimators: Indices  # (|U|,) those of them that are farthest from a_1
+    estimators: Indices  # (|U|,) the words of `near` that are farthest from a_1
     distances: Doubles  # (K,) from the words to the plane
     estimate: Floats  # (3,)
 
 
 def run_attack(seed: int = SEED) -> Toy:
-    """Lift a descriptor, and attack the release."""
+    """Lift a descriptor and attack the release."""
     rng = np.random.default_rng(seed)
     codes = np.rint(255 * (sample_curve(np.linspace(0, 1, WORDS)) + SPREAD * rng.normal(size=(WORDS, 3))).clip(0, 1)).astype(
         np.uint8
@@ -155,7 +156,7 @@ def _draw_plane(axes: Axes, toy: Toy) -> None:
 
 
 def _draw_distances(axes: Axes, toy: Toy) -> None:
-    """Draw the distances to the plane. They have two minima: at the adversarial word, and at d."""
+    """Draw the distances to the plane. They have two minima, at the adversarial word and at d."""
     positions, markers = np.arange(len(toy.words)), list(MARKERS.values())
     rest = np.setdiff1d(toy.near, toy.estimators)
     for marker, words in zip(markers[:4], (positions, rest, toy.estimators, np.array([toy.adversarial])), strict=True):

@@ -1,4 +1,4 @@
-"""Table 1: inverting adversarial affine subspaces. Hybrid lifting of dimension 2 to 16, five attacks."""
+"""Table 1: inversion of adversarial affine subspaces, by hybrid lifting of dimension 2 to 16 and five attacks."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from leaderboard.reproduce.study import Measure, Row, Table, build_plugin, build
 PRINTED = ("mae", "ssim", "psnr")
 DIMS = (2, 4, 8, 16)
 STRONGEST_FIRST = ("database", "clustering", "dia", "nearest")
-MIN_DIFFERENCE = 0.03  # SSIM by which two of the paper's entries must differ for their order to count
-SLACK = 0.01  # SSIM by which the claimed lesser side may be ahead
+MIN_DIFFERENCE = 0.03  # SSIM; the order of two entries counts if they differ by more in the paper
+SLACK = 0.01  # SSIM; the side that is claimed to be less may be greater by this much
 MAX_LOSS = 0.1  # SSIM; the paper's database attack loses .068 from dimension 2 to 16
 
 

@@ -11,16 +11,16 @@ from leaderboard.reproduce.scenes import ALL_DESCRIPTORS, THRESHOLDS, format_nam
 from leaderboard.reproduce.study import Row, Table
 
 PRINTED = tuple(f"recall_{threshold}" for threshold in THRESHOLDS)
-MEASURE = PRINTED[0]  # of the claims: the strictest threshold
+MEASURE = PRINTED[0]  # the measure of the claims: recall at the strictest threshold
 SIZES = ("128000", "256000", "512000", "1024000")
 EPSILONS = ("16", "14", "12", "10")
 SUBSETS = (1, 2, 4, 8, 16)
 TOLERANCE = 5.0  # points of recall; a smaller difference counts as none
-ZERO = 2.0  # points of recall; less counts as none
+ZERO = 2.0  # points of recall; less counts as zero
 
 
 def build_rows(setting: Setting) -> tuple[Row, ...]:
-    rows: dict[str, Row] = {}  # by name: the paper prints a row once per group that it belongs to
+    rows: dict[str, Row] = {}  # by name, because the paper prints a row in each of its groups
     for line in published.read_rows("table2_localization_day"):
         row = scenes.build_row(setting, line, published.parse_numbers(line, PRINTED))
         rows.setdefault(row.name, row)
@@ -74,7 +74,7 @@ def build_common_claims(measure: str) -> tuple[Claim, ...]:
             ),
         ),
         Claim(
-            text=f"Where m/|K| is equal, accuracy equals, to within {TOLERANCE:g} points.",
+            text=f"Accuracy equals that of the other |K| with the same m/|K|, to within {TOLERANCE:g} points.",
             statements=tuple(
                 about_equal(entry("512000", epsilon, 4), entry("256000", epsilon, 2), TOLERANCE) for epsilon in EPSILONS
             ),

@@ -1,6 +1,6 @@
 """Table 3: matchers, dictionaries and RANSAC's trials under LDP-Feat (|K| = 256k, ε = 10, m = 2).
 
-The last row is ours: it retrieves references by the released words alone, which leaks nothing beyond the release.
+The last row is not in the paper. It retrieves references by the released words alone, which leaks nothing beyond the release.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from leaderboard.reproduce.study import Row, Table
 PRINTED = tuple(f"recall_{threshold}" for threshold in THRESHOLDS)
 MEASURE = PRINTED[0]
 POINT = ("256000", "10", 2)  # |K|, ε, m
-MATCHERS = {"mutual-nn": "mutual-nn"}  # other rows match by words, as in Table 2, and share its records
+MATCHERS = {"mutual-nn": "mutual-nn"}  # the other rows match by words and use the records of Table 2
 DICTIONARIES = {"Aachen Ref.": "references", "Places365": "shipped"}
 TRIALS = {"10M": 10_000_000, "1M": 1_000_000, "100k": 100_000, "10k": 10_000}
 RELEASED = "retrieval by released words"
-CPU_TRIALS = {"10M": 100_000, "1M": 30_000, "100k": 10_000, "10k": 3_000}  # of profiles that cannot run the paper's
+CPU_TRIALS = {"10M": 100_000, "1M": 30_000, "100k": 10_000, "10k": 3_000}  # of profiles with fewer trials than the paper
 
 
 def build_rows(setting: Setting) -> tuple[Row, ...]:
@@ -56,7 +56,7 @@ def build_rows(setting: Setting) -> tuple[Row, ...]:
 
 
 def _scale_trials(setting: Setting, variable: str) -> dict[str, int]:
-    """Return the paper's trials, or the number that profile cpu's fraction scales to CPU_TRIALS."""
+    """Return the paper's trials, or the number that profile `cpu` scales to CPU_TRIALS."""
     if variable not in TRIALS:
         return {}
     return {"trials": TRIALS[variable] if setting.profile.trials == 1 else round(CPU_TRIALS[variable] / CPU.trials)}
@@ -90,6 +90,6 @@ TABLE = Table(
     rank_measure=MEASURE,
     notes=(
         *scenes.NOTES,
-        "The last row is ours, and no row of the paper: there, references are retrieved by the released words alone.",
+        "The last row is not in the paper. It retrieves references by the released words alone.",
     ),
 )

@@ -1,4 +1,4 @@
-"""Table 4: direct inversion of LDP-Feat, over |K|, ε and m; and a comparison with attacks on subspaces (Table 1)."""
+"""Table 4: direct inversion of LDP-Feat, over |K|, ε and m, and a comparison with attacks on subspaces (Table 1)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from leaderboard.reproduce.tables import table1
 
 PRINTED = ("mae", "ssim", "psnr")
 BLOCKS = ((256_000, 1), (256_000, 2), (256_000, 4), (512_000, 4))  # |K|, m
-LARGEST = max(size for size, _ in BLOCKS)  # |K|; a smaller one is its first words
+LARGEST = max(size for size, _ in BLOCKS)  # |K|; a smaller dictionary is its first words
 EPSILONS = (16, 14, 12, 10)
 COMPARED = ("database", "clustering", "dia")
 MIN_DIFFERENCE = 0.03  # SSIM; entries that differ by less count as equal
@@ -52,7 +52,7 @@ def _check_size(setting: Setting) -> None:
     if available != required:
         raise UserError(
             f"table4: the dictionary {dictionary} has {available:,} words, and profile {setting.profile.name} needs {required:,} "
-            f"({factor:g} times the paper's {LARGEST:,}); make one with bench dictionary build, and name it with --dictionary"
+            f"({factor:g} times the paper's {LARGEST:,}); make one by `bench dictionary build`, and pass it by --dictionary"
         )
 
 
@@ -88,7 +88,7 @@ def build_claims(paper: Mapping[TableEntry, float]) -> tuple[Claim, ...]:
             statements=tuple(about_equal(one, other, MIN_DIFFERENCE) for one, other in itertools.combinations(subsets[10], 2)),
         ),
         Claim(
-            text="LDP at ε = 10 lies under the database and the clustering attack on subspaces, at every dimension.",
+            text="DIA on LDP at ε = 10 is worse than the database and the clustering attack on subspaces of every dimension.",
             statements=tuple(
                 greater(table1.build_entry(attack, dim), own_entry)
                 for attack in ("database", "clustering")
@@ -97,15 +97,15 @@ def build_claims(paper: Mapping[TableEntry, float]) -> tuple[Claim, ...]:
             ),
         ),
         Claim(
-            text="LDP at ε = 10 lies under DIA on subspaces of dimension 2 and 4.",
+            text="DIA on LDP at ε = 10 is worse than DIA on subspaces of dimension 2 and 4.",
             statements=tuple(greater(table1.build_entry("dia", dim), own_entry) for dim in (2, 4) for own_entry in private),
         ),
         Claim(
-            text=f"LDP at ε = 10 equals DIA on subspaces of dimension 8, to within {MIN_DIFFERENCE:g} SSIM.",
+            text=f"DIA on LDP at ε = 10 equals DIA on subspaces of dimension 8, to within {MIN_DIFFERENCE:g} SSIM.",
             statements=tuple(about_equal(own_entry, table1.build_entry("dia", 8), MIN_DIFFERENCE) for own_entry in private),
         ),
         Claim(
-            text="LDP at ε = 10 lies above DIA on subspaces of dimension 16.",
+            text="DIA on LDP at ε = 10 is better than DIA on subspaces of dimension 16.",
             statements=tuple(greater(own_entry, table1.build_entry("dia", 16)) for own_entry in private),
         ),
     )

@@ -1,7 +1,7 @@
-"""Table S2: structure from motion of releases alone, over m, at one |K| and ε; with a picture of each model.
+"""Table S2: structure from motion from releases alone, over m, at one |K| and one ε; with a picture of each model.
 
-The paper has two scenes, South Building and Fountain; ours is compared with both. Mapping and releases are random, so each row
-runs with several seeds. Intervals are over seeds, and hold for this scene alone.
+The paper has two scenes, South Building and Fountain. Ours is compared with both. Mapping and releases are random, so each row
+runs with several seeds. Intervals are over seeds, and they hold for this scene alone.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ if TYPE_CHECKING:
 
     from bench.datasets.walk import Walk
 
-COMPARED_SCENE, OTHER_SCENE = "South Building", "Fountain"  # the scene beside ours, and the scene in a column of its own
+COMPARED_SCENE, OTHER_SCENE = "South Building", "Fountain"  # compared with our scene; in a separate column
 IMAGES = 128.0  # of South Building
 WORDS = "512000"
 SUBSETS = (4, 8, 16, 32, 64)
 BEST = 32
-NEAR_BEST = 0.9  # fraction of the best that counts as equal
+NEAR_BEST = 0.9  # a value above this fraction of the best counts as equal
 MIN_DIFFERENCE = 5000.0  # points of South Building
 PRINTED = {"registered": "registered_images", "points": "sparse_points"}  # our measure -> the paper's column
 PRINTED |= {name: name for name in ("track_length", "reprojection_error")}
@@ -105,7 +105,7 @@ def build_claims(paper: Mapping[TableEntry, float]) -> tuple[Claim, ...]:
             ),
         ),
         Claim(
-            text="The points that are left are not worse: the reprojection error of raw descriptors is the greatest.",
+            text="The remaining points are not worse: the reprojection error of raw descriptors is the greatest.",
             statements=tuple(
                 greater(("raw", "reprojection_error"), entry)
                 for entry in [("no privacy", "reprojection_error"), *private("reprojection_error")]
@@ -137,11 +137,11 @@ PANEL_METRICS = {"registered": "registered", "right": "right_poses", "points": "
 
 
 def draw_figures(data: FigureData) -> Iterator[tuple[str, Figure]]:
-    """Yield a figure with an image of the scene, and the models of the first seed from above."""
+    """Yield a figure with an image of the scene, and with the models of the first seed seen from above."""
     sample = next(record["sample"] for row in data.result.rows for record in select_records(data.result, row.name))
     panels = [Panel(original, name, "") for name, original in itertools.islice(data.load_originals(), 1)]
     panels += [data.build_panel(row.name, sample, row.name, PANEL_METRICS, digits=0) for row in data.result.rows]
-    yield "models", draw(panels, f"Structure from motion of {sample} from above; red wedges open where cameras look", 4)
+    yield "models", draw(panels, f"Structure from motion of {sample} from above; red wedges show viewing directions", 4)
 
 
 TABLE = Table(

@@ -1,6 +1,6 @@
 """Table S3: intersections of a subspace with the manifold of descriptors.
 
-`bench/tasks/intersections.py` explains the interpretation of the paper.
+`bench/tasks/intersections.py` explains our interpretation of the paper.
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ TABLE = Table(
     build_claims=build_claims,
     notes=(
         "A word near a subspace succeeds if it matches one of the m/2 + 1 points that the subspace was built from, by the ratio "
-        "test at 0.8. The adversarial words themselves are left out of the N; with them, success at m = 16 and N = 5 is 100% "
-        "whatever the data, which is not what the paper prints.",
-        "Subspaces: of each photograph; its descriptors are lifted again until there are as many.",
+        "test at 0.8. The adversarial words themselves do not count among the N. With them, success at m = 16 and N = 5 is 100% "
+        "for any data, and the paper prints less.",
+        "Subspaces: their number per photograph. Its descriptors are lifted repeatedly until this number is reached.",
     ),
 )

@@ -1,4 +1,4 @@
-"""Table S4: collisions in the clustering attack. `bench/tasks/collisions.py` explains the interpretation of the paper."""
+"""Table S4: collisions in the clustering attack. `bench/tasks/collisions.py` explains our interpretation of the paper."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ TABLE = Table(
     build_rows=build_rows,
     build_claims=build_claims,
     notes=(
-        "An adversarial word a_i that no other release goes through counts as a collision. The other columns show how "
+        "An adversarial word a_i that no other release contains counts as a collision. The other columns show how "
         "often this happens, and the result without it.",
     ),
 )

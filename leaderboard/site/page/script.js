@@ -117,15 +117,15 @@ function comparison(dialog) {
   function choose(button) {
     const { sample, score, reconstruction: reconstructionPath, original: originalPath } = button.dataset;
     reconstruction.src = reconstructionPath;
-    reconstruction.alt = `The reconstruction of ${sample}`;
+    reconstruction.alt = `Reconstruction of ${sample}`;
     original.hidden = !originalPath;
     slider.disabled = !originalPath;
     if (originalPath) {
       original.src = originalPath;
-      original.alt = `The photograph ${sample}`;
+      original.alt = `Photograph ${sample}`;
     }
     stage.classList.toggle("alone", !originalPath);
-    dialog.querySelector("output").textContent = [sample, score, originalPath ? "" : "the photograph is not beside these records"]
+    dialog.querySelector("output").textContent = [sample, score, originalPath ? "" : "the results folder has no photograph of this sample"]
       .filter(Boolean)
       .join(" · ");
     for (const other of buttons) other.setAttribute("aria-pressed", String(other === button));
@@ -134,9 +134,9 @@ function comparison(dialog) {
   slider.addEventListener("input", slide);
   for (const button of buttons) button.addEventListener("click", () => choose(button));
   slide();
-  // Images are fetched when the dialog first opens.
+  // Images are fetched when the dialog first opens: first the sample of the pictures above the table.
   new MutationObserver(() => {
-    if (dialog.open && !reconstruction.src) choose(buttons[0]);
+    if (dialog.open && !reconstruction.src) choose(buttons.find((button) => button.getAttribute("aria-pressed") === "true") ?? buttons[0]);
   }).observe(dialog, { attributeFilter: ["open"] });
 }
 

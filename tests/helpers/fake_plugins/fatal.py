@@ -1,4 +1,4 @@
-"""Ends the process that it runs in: once, or always."""
+"""An attack that kills its process, once or always."""
 
 import os
 import signal
@@ -13,11 +13,11 @@ from bench.types import Descriptors, Floats, Subspaces, WordSets
 
 @dataclass(frozen=True, kw_only=True)
 class Fatal(ImageAttack):
-    """Grey, where it does not kill its process: the first time, or every time if there is no marker."""
+    """Kills its process at the first call, or without a marker at every call. Otherwise returns a grey image."""
 
     accepts = (Descriptors, WordSets, Subspaces)
 
-    marker: str = ""  # a file that says that it has been done; as text, since its content is no configuration
+    marker: str = ""  # a file that exists after the first call; text, since its content is not part of the configuration
 
     def reconstruct(self, view: View, rng: np.random.Generator) -> Floats:
         marker = Path(self.marker) if self.marker else None

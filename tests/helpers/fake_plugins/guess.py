@@ -11,7 +11,7 @@ from bench.types import Floats, Subspaces, WordSets
 
 @dataclass(frozen=True, kw_only=True)
 class Guess(DescriptorAttack):
-    """Takes the first candidate."""
+    """Returns the first candidate of each keypoint."""
 
     accepts = (WordSets, Subspaces)
 

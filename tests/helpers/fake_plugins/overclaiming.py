@@ -1,4 +1,4 @@
-"""A defense that claims an ε that it does not keep."""
+"""A defense that claims an ε and does not satisfy it."""
 
 from dataclasses import dataclass
 

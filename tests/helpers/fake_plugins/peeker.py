@@ -1,4 +1,4 @@
-"""Cheats: looks for the secret in the memory of the process that it runs in."""
+"""A cheating attack: it looks for the secret in the memory of its process."""
 
 import gc
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from bench.types import Features, Floats, WordSets
 
 @dataclass(frozen=True, kw_only=True)
 class Peeker(DescriptorAttack):
-    """Takes the true descriptors where it finds them, and else the first candidate."""
+    """Returns the true descriptors if it finds them, otherwise the first candidates."""
 
     accepts = (WordSets,)
 

@@ -10,7 +10,7 @@ from bench.types import Descriptors, Floats, Subspaces, WordSets
 
 @dataclass(frozen=True, kw_only=True)
 class Sketch(ImageAttack):
-    """Noise, with a dot at each keypoint."""
+    """Returns noise with a dot at each keypoint."""
 
     accepts = (Descriptors, WordSets, Subspaces)
 

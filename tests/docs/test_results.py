@@ -1,0 +1,78 @@
+"""Every page and picture with results names a valid command and the files that it used, and these are the shipped ones."""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from bench.cli import build_parser
+from leaderboard.provenance import CHUNK, HEADING, list_stale
+from leaderboard.reproduce import command, tables
+
+ROOT = Path(__file__).resolve().parents[2]
+RESULTS = [*sorted((ROOT / "docs" / "results").glob("*.md")), *sorted((ROOT / "docs" / "images").glob("*.png"))]
+
+
+def read_text(path: Path) -> str:
+    """Return a page, or the provenance of a picture."""
+    return path.read_text(encoding="utf-8") if path.suffix == ".md" else Image.open(path).info.get(CHUNK, "")
+
+
+def explain_invalid(text: str) -> str | None:
+    """Return why the provenance of a text names no valid command; None if it does."""
+    named = re.search(r"```\n(.+)\n```", text.rpartition(HEADING)[2])
+    program, *words = shlex.split(named[1]) if named else [""]
+    if program == "bench":
+        args, extra = build_parser().parse_known_args(words)
+        if extra or not all(getattr(args, option) for option in args.required):
+            return f"bench does not accept {words}"
+        known = {*tables.load_tables(), *command.group_drawings()}
+        return None if words[0] != "reproduce" or args.what in known else f"no table {args.what}"
+    if program != "python" or not (ROOT / words[0]).is_file():
+        return "no such program"
+    options, source = {word for word in words if word.startswith("--")}, (ROOT / words[0]).read_text(encoding="utf-8")
+    return next((f"{words[0]} has no {option}" for option in options if f'"{option}"' not in source), None)
+
+
+@pytest.mark.parametrize("path", RESULTS, ids=lambda path: path.name)
+def test_results_are_of_the_shipped_files(path: Path) -> None:
+    assert list_stale(read_text(path)) == []
+    assert explain_invalid(read_text(path)) is None
+
+
+PAGE = (ROOT / "docs" / "results" / "table1.md").read_text(encoding="utf-8")
+
+
+def test_stale_pages_are_found() -> None:
+    digest = re.search(r"`inversion-none.safetensors` \| `([0-9a-f]{16})`", PAGE)
+    assert digest is not None
+    assert list_stale(PAGE.replace(digest[1], "0123456789abcdef")) == [
+        f"inversion-none.safetensors: used 0123456789abcdef, shipped is {digest[1]}"
+    ]
+    assert list_stale(PAGE.replace("inversion-none", "inversion-other")) == [
+        f"inversion-other.safetensors: used {digest[1]}, shipped is None"
+    ]
+
+
+def test_pages_without_provenance_are_found() -> None:
+    body = PAGE.partition(HEADING)[0]
+    for text in ("", body, f"{body}{HEADING}\n\n```\nbench reproduce table1\n```\n", f"{PAGE}\n{HEADING}\n"):
+        assert list_stale(text) == ["no provenance"]
+
+
+@pytest.mark.parametrize(
+    ("line", "complaint"),
+    [
+        ("bench reproduce table9", "no table table9"),
+        ("bench reproduce table1 --image photos/", "bench does not accept"),
+        ("bench run --attack dia", "bench does not accept"),
+        ("python tools/gone.py", "no such program"),
+        ("python tools/tune_attacks.py --attack dia", "tools/tune_attacks.py has no --attack"),
+        ("make demo", "no such program"),
+    ],
+)
+def test_invalid_commands_are_found(line: str, complaint: str) -> None:
+    assert explain_invalid(PAGE) is None
+    assert complaint in str(explain_invalid(PAGE.replace("bench reproduce table1\n", f"{line}\n")))

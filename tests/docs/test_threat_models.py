@@ -1,0 +1,59 @@
+"""The table of docs/threat-models.md has the release types and the knowledge that each attack declares."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from bench import threat_model
+from bench.api import Attack, ImageAttack
+from bench.registry import discovery
+from bench.threat_model import Knowledge
+from bench.types import Descriptors, Release, Subspaces, WordSets
+
+PAGE = (Path(__file__).resolve().parents[2] / "docs" / "threat-models.md").read_text(encoding="utf-8")
+RELEASES: dict[str, type[Release]] = {"descriptors": Descriptors, "subspaces": Subspaces, "word sets": WordSets}
+ATTACKS = {
+    attack.name(): attack for attack in discovery.load_plugins(discovery.ATTACK) if attack.__module__.startswith("attacks.")
+}
+
+
+def read_rows(page: str) -> dict[str, list[str]]:
+    """Return the columns release, knowledge and recovers of each attack's row."""
+    rows = re.findall(r"^\| \[`([a-z]+)`\]\(#\1\) \| (.+?) \| (.+?) \| (.+?) \|", page, re.MULTILINE)
+    return {name: columns for name, *columns in rows}
+
+
+def test_every_attack_has_a_row_and_a_section() -> None:
+    assert read_rows(PAGE).keys() == ATTACKS.keys() == set(re.findall(r"^### `(.+)`$", PAGE, re.MULTILINE))
+
+
+def list_wrong_rows(page: str) -> list[str]:
+    """Return the attacks whose row differs from the declarations."""
+    return [name for name, columns in read_rows(page).items() if not _agrees(ATTACKS[name], *columns)]
+
+
+def _agrees(attack: type[Attack], releases: str, knowledge: str, recovers: str) -> bool:
+    accepted = RELEASES.values() if releases == "any" else [RELEASES[kind] for kind in releases.split(", ")]
+    return (
+        set(accepted) == set(attack.accepts)
+        and set(re.findall(r"`(\w+)`", knowledge)) == {kind.__name__ for kind in attack.needs}
+        and (recovers == "image") == issubclass(attack, ImageAttack)
+    )
+
+
+def test_rows_have_the_declarations() -> None:
+    assert not list_wrong_rows(PAGE)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"), [("`DefenseDatabase`", "none"), ("subspaces", "word sets"), ("descriptors | database attack", "image | x")]
+)
+def test_a_wrong_row_is_noticed(old: str, new: str) -> None:
+    row = next(line for line in PAGE.splitlines() if line.startswith("| [`database`]"))
+    assert list_wrong_rows(PAGE.replace(row, row.replace(old, new))) == ["database"]
+
+
+def test_every_kind_of_knowledge_is_explained() -> None:
+    kinds = {name for name, kind in vars(threat_model).items() if isinstance(kind, type) and issubclass(kind, Knowledge)}
+    assert set(re.findall(r"^\| `(\w+)` \|", PAGE, re.MULTILINE)) == kinds - {"Knowledge"}

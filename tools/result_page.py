@@ -1,0 +1,52 @@
+"""Shared by the tools that write pages in docs/results/: a cache of each sample's results, intervals as text, and provenance."""
+
+from __future__ import annotations
+
+import itertools
+import shlex
+import sys
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from bench.cache import provenance, store
+from bench.core import environment
+from bench.formats.tensor_file import Arrays
+from leaderboard.intervals import Interval
+from leaderboard.provenance import format_provenance
+
+RESULTS = Path(__file__).parents[1] / "docs" / "results"
+PLACEHOLDERS = {"--data": "DATA", "--work": "WORK"}  # option -> text for its value, a local folder
+
+
+def cache_arrays(tool: str, inputs: Any, compute: Callable[[], Arrays]) -> Arrays:
+    """Return arrays from the cache, or from `compute`, so that an interrupted tool resumes.
+
+    Parameters
+    ----------
+    tool : module of the tool; its source, and that of all that it imports from our packages, is part of the key
+    inputs : JSON: everything else that the arrays depend on
+    """
+    key = {"inputs": inputs, "source": provenance.hash_modules(tool), "environment": environment.describe_platform()}
+    return store.fetch(tool.replace("_", "-"), key, lambda: (compute(), {}))[0]
+
+
+def format_interval(value: Interval, digits: int, sign: str = "") -> str:
+    """Return the mean and the ends of an interval. `sign` "+" shows the sign of positive numbers."""
+    return f"{value.mean:{sign}.{digits}f} [{value.low:{sign}.{digits}f}, {value.high:{sign}.{digits}f}]"
+
+
+def write_page(name: str, text: str, configurations: Iterable[Mapping[str, Any]]) -> None:
+    """Write a page of docs/results/ that ends with the command of this process and the files that `configurations` refer to."""
+    section = format_provenance(format_command(sys.argv), configurations)
+    (RESULTS / name).write_text(f"{text.rstrip()}\n\n{section}", encoding="utf-8")
+
+
+def format_command(argv: list[str]) -> str:
+    """Return the command line of a tool, with placeholders for local folders.
+
+    >>> format_command(["tools/tune_attacks.py", "--data", "/home/me/photographs"])
+    'python tools/tune_attacks.py --data DATA'
+    """
+    words = [PLACEHOLDERS.get(before, word) for before, word in itertools.pairwise(argv)]
+    return shlex.join(["python", f"tools/{Path(argv[0]).name}", *words])
