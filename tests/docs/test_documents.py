@@ -39,9 +39,16 @@ LONG = {
     "train --defense none --images megadepth/ --out W.safetensors --profile paper --devices 4": (
         "--validation unseen/ --steps 1 --batch 2 --widths 8,8 --devices 2"
     ),
+    "reproduce tableS2": "--profile smoke --dataset walk:views=4,others=6,steps=60,width=320,height=240,detail=0.3",
 }
-# Never run here, with the reason.
-UNTESTED: dict[str, str] = {}
+# Commands that are parsed only, by their beginnings, with the reason.
+UNTESTED = {
+    "reproduce figure-inlier": "minutes; tests/leaderboard/test_reproduce.py draws it from a small gallery",
+    "reproduce tableS2 --dataset captured:path=fox/": "its photographs are no part of this distribution",
+    "run --task localization --dataset captured:path=fox/": "its photographs are no part of this distribution",
+    "run --defense none --defense affine --defense ldp:epsilon=16": "the release step of networks: 100 photographs for reporting",
+    "run --defense none --attack dia --extractor sift:upright=false": "the release step of networks: 100 photographs for reporting",
+}
 
 
 # ---- examples that run as printed
@@ -59,8 +66,9 @@ def folder(tmp_path: Path) -> Path:
     return folder
 
 
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("name", EXECUTED)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow if name == "README" else pytest.mark.exhaustive) for name in EXECUTED]
+)
 def test_examples_run_as_printed(name: str, folder: Path, environment: Path) -> None:
     if not name.startswith(TUTORIALS):
         for number, photograph in enumerate(list_builtin()):
@@ -188,7 +196,7 @@ def test_listed_commands_run(
             install_plugins(workspace / "installed", monkeypatch, plugins)
             monkeypatch.syspath_prepend(workspace / "my-defense")
         arguments = build_arguments(command)
-        if command not in LONG.keys() | UNTESTED.keys():
+        if command not in LONG and not command.startswith(tuple(UNTESTED)):
             assert cli.main(arguments) == 0, (command, capfd.readouterr().err)
 
 
@@ -213,7 +221,9 @@ def build_arguments(command: str) -> list[str]:
 
 
 def test_exceptions_are_of_listed_commands() -> None:
-    assert {command for listed in LISTED.values() for command in listed} >= SMALLER.keys() | LONG.keys() | UNTESTED.keys()
+    listed = {command for commands in LISTED.values() for command in commands}
+    assert listed >= SMALLER.keys() | LONG.keys()
+    assert all(any(command.startswith(beginning) for command in listed) for beginning in UNTESTED)
 
 
 def test_all_kinds_of_plugins_are_shown() -> None:

@@ -1,34 +1,58 @@
-"""The code and the commands of the README work."""
+"""The table of results in the README is the one that `make demo` prints, and the README is short."""
 
 import re
+import shlex
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from bench.cli import build_parser
-from bench.codebook import examples
-from bench.codebook.public import Public
-from bench.registry import discovery
+from bench import cli
 
-README = (Path(__file__).resolve().parents[2] / "README.md").read_text(encoding="utf-8")
+ROOT = Path(__file__).resolve().parents[2]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+TOLERANCE = {"MAE": 0.002, "SSIM": 0.005, "PSNR": 0.1}  # between machines: float32 or bf16
 
-
-def test_the_defense_in_twenty_lines(tmp_path, monkeypatch):
-    code = next(block for block in re.findall(r"```python\n(.*?)```", README, re.DOTALL) if "class Rounding" in block)
-    (tmp_path / "rounding.py").write_text(code)
-    monkeypatch.syspath_prepend(tmp_path)
-    import rounding
-
-    plugin = discovery.check(discovery.DEFENSE, rounding.PLUGIN)
-    secret = examples.draw_features(20, 0)
-    release = plugin(levels=4).protect(secret, Public(), np.random.default_rng(0))
-    assert set(np.unique(release.descriptors * 4)) <= {0, 1, 2, 3, 4}
-    assert plugin.name() == "rounding"
+Row = dict[str, str]
 
 
-@pytest.mark.parametrize("line", re.findall(r"^(?:\.venv/bin/)?bench (.+?)(?:\s+#.*)?$", README, re.MULTILINE))
-def test_commands_are_parsed(line):
-    args, extra = build_parser().parse_known_args(line.split())
-    assert not extra
-    assert all(getattr(args, option) for option in args.required)
+def read_table(text: str) -> list[Row]:
+    """Return the rows of the first Markdown table by column. Defenses are without their settings' defaults."""
+    lines = [re.split(r" *\| *", line.strip("| ")) for line in text.splitlines() if line.startswith("|")]
+    rows = [dict(zip(lines[0], line, strict=True)) for line in lines[2:]]
+    return [row | {"defense": row["defense"].removesuffix(":sends=positions")} for row in rows]
+
+
+def list_differences(printed: list[Row], reported: list[Row]) -> list[str]:
+    """Return the entries of the README that are not those of the report."""
+    differences = ["another number of rows"] if len(printed) != len(reported) else []
+    for row, other in zip(printed, reported, strict=False):
+        for column, text in row.items():
+            tolerance = TOLERANCE.get(column)
+            same = text == other[column] if tolerance is None else abs(float(text) - float(other[column])) <= tolerance
+            differences += [] if same else [f"{row['defense']}, {row['attack']}: {column} {text}, reported {other[column]}"]
+    return differences
+
+
+def test_the_readme_is_short() -> None:
+    assert len(README.splitlines()) <= 150
+
+
+@pytest.mark.exhaustive
+def test_results_are_those_of_the_demo(tmp_path: Path) -> None:
+    options = re.search(r"^DEMO \?= (.+)$", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+    assert options is not None
+    assert cli.main(["run", *shlex.split(options[1]), "--out", str(tmp_path / "run")]) == 0
+    reported = read_table((tmp_path / "run" / "report.md").read_text(encoding="utf-8"))
+    printed = read_table(README[README.index("## Results") :])
+    assert list_differences(printed, reported) == []
+    assert len(printed) == 8
+
+
+def test_other_results_are_found() -> None:
+    printed = read_table(README[README.index("## Results") :])
+    assert list_differences(printed, printed) == []
+    assert list_differences(printed, [printed[0] | {"SSIM": "0.6"}, *printed[1:]]) == ["none, dia: SSIM 0.6771, reported 0.6"]
+    assert list_differences(printed, [printed[0] | {"attack": "nearest"}, *printed[1:]]) == [
+        "none, dia: attack dia, reported nearest"
+    ]
+    assert list_differences(printed, printed[1:])[0] == "another number of rows"

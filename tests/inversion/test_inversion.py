@@ -233,7 +233,7 @@ def build_plan(sources, **given):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("defense", [Undefended(), Affine(lifting="random", dim=2)])
+@pytest.mark.parametrize("defense", [Undefended(), pytest.param(Affine(lifting="random", dim=2), marks=pytest.mark.exhaustive)])
 def test_a_resumed_training_is_the_same_training(defense, sources, tmp_path, monkeypatch):
     import bench.inversion.train as module
 
@@ -262,7 +262,9 @@ def test_a_resumed_training_is_the_same_training(defense, sources, tmp_path, mon
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("defense", [Undefended(), LDP(epsilon=8, subset_size=2, words=2000)])
+@pytest.mark.parametrize(
+    "defense", [Undefended(), pytest.param(LDP(epsilon=8, subset_size=2, words=2000), marks=pytest.mark.exhaustive)]
+)
 def test_views_on_demand_train_the_same_network(defense, sources, tmp_path, monkeypatch):
     """Views that do not fit into memory are read repeatedly, with the same result."""
     import bench.inversion.train as module

@@ -1,13 +1,13 @@
 """The page in a real browser: use by mouse, by keyboard and on a phone."""
 
 import re
-import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import fabricated
 import pytest
+from browser import open_browser
 from fabricated import (
     DIA,
     ENVIRONMENT,
@@ -31,17 +31,6 @@ from leaderboard.site.overview import build_overview
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 
-CHROMIUM = shutil.which("chromium")
-FLAGS = [
-    "--headless",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-]
 HOSTILE = """"><script>window.owned = 1</script><img src=x onerror="window.owned = 2">'{{ 7 * 7 }}</style></script>"""
 NONE, AFFINE, NEAREST = {"name": "none"}, {"name": "affine", "dim": 4}, {"name": "nearest"}
 DAYS = ["day", "night"] * 4
@@ -85,12 +74,8 @@ def index(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    if CHROMIUM is None:
-        pytest.skip("there is no Chromium here (.ci/run installs it)")
-    with playwright.sync_playwright() as running:
-        opened = running.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+    with open_browser() as opened:
         yield opened
-        opened.close()
 
 
 @pytest.fixture

@@ -39,7 +39,7 @@ def stored(module: Any) -> dict[str, torch.Tensor]:
     return weights
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_vgg_features_agree_with_torchvision(module: Any, stored: dict[str, torch.Tensor]) -> None:
     from torchvision.models.feature_extraction import create_feature_extractor
 
@@ -57,7 +57,7 @@ def test_vgg_features_agree_with_torchvision(module: Any, stored: dict[str, torc
     assert float((found[0] - raw[LAYERS[0]]).norm() / raw[LAYERS[0]].norm()) > 0.2  # control: colours without normalisation
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.usefixtures("stored")
 def test_the_loss_grows_with_the_difference_and_has_a_gradient(module: Any) -> None:
     photograph = torch.rand(1, 3, 64, 64)

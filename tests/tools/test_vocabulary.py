@@ -28,6 +28,6 @@ def test_other_words_are_allowed(tmp_path: Path, code: str) -> None:
     assert check_vocabulary.check([tmp_path / "module.py"]) == []
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive  # and `make lint`
 def test_the_project_has_no_private_word() -> None:
     assert check_vocabulary.check(check_vocabulary.list_files()) == []
