@@ -17,7 +17,7 @@ Row = dict[str, str]
 
 def read_table(text: str) -> list[Row]:
     """Return the rows of the first Markdown table by column. Defenses are without their settings' defaults."""
-    lines = [re.split(r" *\| *", line.strip("| ")) for line in text.splitlines() if line.startswith("|")]
+    lines = [[text.strip() for text in line.split("|")[1:-1]] for line in text.splitlines() if line.startswith("|")]
     rows = [dict(zip(lines[0], line, strict=True)) for line in lines[2:]]
     return [row | {"defense": row["defense"].removesuffix(":sends=positions")} for row in rows]
 
