@@ -39,15 +39,14 @@ LONG = {
     "train --defense none --images megadepth/ --out W.safetensors --profile paper --devices 4": (
         "--validation unseen/ --steps 1 --batch 2 --widths 8,8 --devices 2"
     ),
-    "reproduce tableS2": "--profile smoke --dataset walk:views=4,others=6,steps=60,width=320,height=240,detail=0.3",
 }
 # Commands that are parsed only, by their beginnings, with the reason.
 UNTESTED = {
-    "reproduce figure-inlier": "minutes; tests/leaderboard/test_reproduce.py draws it from a small gallery",
-    "reproduce tableS2 --dataset captured:path=fox/": "its photographs are no part of this distribution",
-    "run --task localization --dataset captured:path=fox/": "its photographs are no part of this distribution",
-    "run --defense none --defense affine --defense ldp:epsilon=16": "the release step of networks: 100 photographs for reporting",
-    "run --defense none --attack dia --extractor sift:upright=false": "the release step of networks: 100 photographs for reporting",
+    "reproduce figure-inlier": "minutes; test_reproduce.py runs it in the profile smoke",
+    "reproduce tableS2": "minutes; test_reproduce.py runs it in the profile smoke",
+    "run --task localization --dataset captured:path=fox/": "its photographs are not distributed",
+    "run --defense none --defense affine --defense ldp:epsilon=16": "the release of networks: 100 photographs",
+    "run --defense none --attack dia --extractor sift:upright=false": "the release of networks: 100 photographs",
 }
 
 
