@@ -33,7 +33,7 @@ from pathlib import Path
 from markdown_it import MarkdownIt
 
 PROMPT = re.compile(r"^\$ ((?:.*\\\n)*.*)\n((?:(?!\$ ).*\n)*)", re.MULTILINE)  # a command, and its output
-ASK_STATUS = "echo $?"
+PRINT_STATUS = "echo $?"
 MARK = "\x1e"  # ends the output of a command, before and after its exit status
 PROGRESS = re.compile(r"^.*: \d+/\d+ .*\d+ s left\n", re.MULTILINE)  # a terminal shows a bar instead
 TIMEOUT = 1800  # seconds of a page
@@ -74,9 +74,9 @@ def _parse_console(block: Block) -> Iterator[Command]:
     assert block.text.startswith("$ "), f"line {block.line}: a console block begins with '$ '"
     matches = list(PROMPT.finditer(block.text))
     for match, following in zip(matches, [*matches[1:], None], strict=True):
-        asked = following is not None and following[1] == ASK_STATUS
+        status = int(following[2]) if following is not None and following[1] == PRINT_STATUS else 0
         line = block.line + block.text.count("\n", 0, match.start())
-        yield Command(match[1], line, _normalise(match[2]), int(following[2]) if following is not None and asked else 0)
+        yield Command(match[1], line, _normalise(match[2]), status)
 
 
 def _parse_python(block: Block) -> Iterator[Command]:
