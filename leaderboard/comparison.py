@@ -21,6 +21,7 @@ from bench.runner import records as files
 from bench.runner.records import FILE, Record
 from leaderboard.intervals import Interval
 from leaderboard.measures import PRIVACY, Measure, list_measures, summarize
+from leaderboard.signal import Signal, judge_experiments
 from leaderboard.tables import FIRST_METRICS, build_labels, format_setting, label_extractor, name_samples
 
 T = TypeVar("T")
@@ -120,6 +121,17 @@ class ComparisonGroup:
     def has_attacks(self) -> bool:
         """Whether the group judges attacks on releases, and not the releases themselves."""
         return any(experiment.metadata["attack"] is not None for experiment in self.experiments)
+
+    @functools.cached_property
+    def signals(self) -> dict[GroupedExperiment, Signal]:
+        """The signal of each experiment that has one, over the samples that it has completed with every seed."""
+        records = {
+            experiment: [record for sample in self.complete_samples(experiment) for record in sample]
+            for experiment in self.experiments
+        }
+        completed = {experiment: each for experiment, each in records.items() if each}
+        signals = zip(completed, judge_experiments(list(completed.values())), strict=True)
+        return {experiment: signal for experiment, signal in signals if signal is not None}
 
     def complete_samples(self, experiment: GroupedExperiment) -> list[list[Record]]:
         """Return the records of each sample that the experiment has completed with every seed."""

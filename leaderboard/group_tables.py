@@ -11,6 +11,7 @@ from statistics import median
 from bench.core.table import NOT_APPLICABLE, Column, Row, Table
 from bench.mechanisms.composition import UNCOVERED
 from bench.runner.records import Record
+from leaderboard import chance, signal
 from leaderboard.comparison import ComparisonGroup, GroupedExperiment
 from leaderboard.intervals import LEVEL, Interval
 from leaderboard.measures import Measure
@@ -20,13 +21,14 @@ from leaderboard.tables import COMPOSITION_REMARK, SEED_REMARK, format_chance, f
 Value = Interval | float | int | str | None
 
 INTERVAL_REMARK = (
-    f"In brackets: the {LEVEL:.0%} percentile bootstrap over the samples, or Wilson's interval if each sample succeeds or fails. "
+    f"In brackets: the {LEVEL:.0%} interval of Student's t over the samples, or Wilson's if each sample succeeds or fails. "
     "A single sample and a median have no interval."
 )
 NOT_APPLICABLE_REMARK = f"{NOT_APPLICABLE} without a note: the metric does not apply to the result of the attack."
 RANK_REMARK = (
-    "Rank: by the strongest attack, the one with the greatest mean SSIM. The best values of ranked defenses are bold. A defense "
-    "is unranked and comes last if no attacker was adapted to it, or if an attack has not completed all samples."
+    "Rank: by the strongest attack, the one with the greatest mean SSIM among the attacks with a signal. The best values of "
+    "ranked defenses are bold. A defense is unranked and comes last if no attacker was adapted to it, if an attack has not "
+    "completed all samples, or if no attack has a signal: the benchmark cannot say how private it is."
 )
 
 
@@ -59,7 +61,7 @@ def build_pairs_table(group: ComparisonGroup) -> GroupTable:
     """Return a table with a row for each experiment. With attacks, rows are in the order of rank, the strongest attack first."""
     columns = _build_columns(group)
     explanations = [f"{measure.label}: {measure.explanation}" for measure in group.measures if measure.explanation]
-    rank = [RANK_REMARK] if group.has_attacks else []
+    rank = [RANK_REMARK, *_list_signal_remarks(group)] if group.has_attacks else []
     return GroupTable(
         heading=", ".join([group.title, *group.facts]),
         columns=columns,
@@ -97,9 +99,16 @@ _GUARANTEES = {
 }
 
 
+def _list_signal_remarks(group: ComparisonGroup) -> list[str]:
+    """Return the remarks on signals, chance and baselines that are missing."""
+    chance_remark = [chance.REMARK] if any(measure.name == chance.IDENTIFIED for measure in group.measures) else []
+    untested = signal.explain_untested(list(group.signals.values()))
+    return [signal.REMARK, *chance_remark, *([untested] if untested else [])]
+
+
 def _build_columns(group: ComparisonGroup) -> tuple[GroupColumn, ...]:
     rank = [GroupColumn(name="rank", label="rank")] if group.has_attacks else []
-    attack = [GroupColumn(name="attack", label="attack", text=True)] if group.has_attacks else []
+    attack = [GroupColumn(name=name, label=name, text=True) for name in ("attack", "signal")] if group.has_attacks else []
     return (
         *rank,
         GroupColumn(name="defense", label="defense", text=True),
@@ -145,7 +154,7 @@ def _order_experiments(group: ComparisonGroup) -> Iterable[tuple[GroupedExperime
 def _build_row(
     group: ComparisonGroup, columns: Sequence[GroupColumn], experiment: GroupedExperiment, standing: Standing | None
 ) -> GroupRow:
-    privacy = experiment.metadata["privacy"]
+    privacy, verdict = experiment.metadata["privacy"], group.signals.get(experiment)
     per_image = [value for record in experiment.completed if (value := spent_epsilon(record["privacy"])) is not None]
     count = None if experiment.reason else len(group.complete_samples(experiment))
     known: dict[str, Value] = {
@@ -155,6 +164,7 @@ def _build_row(
         "epsilon_descriptor": None if privacy["epsilon_descriptor"] is None else float(privacy["epsilon_descriptor"]),
         "epsilon_image": median(per_image) if per_image else None,
         "attack": experiment.attack,
+        "signal": verdict.word if verdict else None,
         "log10_true": None if privacy["log10_true"] is None else float(privacy["log10_true"]),
         "units": count,
     }
@@ -218,6 +228,9 @@ def _list_notes(group: ComparisonGroup, experiment: GroupedExperiment, standing:
         yield f"{missing} of {len(group.samples)} samples missing"
     if failed := experiment.failed:
         yield f"{len(failed)} failed: {failed[0]['sample']}: {failed[0]['reason']}"
+    verdict = group.signals.get(experiment)
+    if verdict and verdict.is_absent and verdict.text != unranked_reason:
+        yield verdict.text
     completed = experiment.completed
     first_notes = completed[0].get("notes", ()) if completed else ()
     yield from (note for note in first_notes if all(note in record["notes"] for record in completed))

@@ -14,6 +14,7 @@ from typing import Literal
 import numpy as np
 
 from bench.registry import discovery
+from leaderboard.chance import IDENTIFIED, label_identified
 from leaderboard.intervals import Interval, interval, proportion
 from leaderboard.tables import MEDIAN_METRICS, PAPER_METRICS
 
@@ -34,6 +35,7 @@ class Measure:
     # A fraction is that of the samples that succeed. For a median, a sample without a value counts as the worst.
     kind: Literal["mean", "fraction", "median"] = "mean"
     explanation: str = ""
+    is_fraction: bool = False  # of a sample's parts, such as its faces; Wilson's interval where all values are 0 or 1
 
 
 def list_measures(names: Iterable[str]) -> list[Measure]:
@@ -61,7 +63,7 @@ def _summarize(measure: Measure, values: tuple[float | None, ...]) -> Interval |
     if measure.kind == "median":
         middle = float(np.median([math.inf if value is None else value for value in values]))
         return Interval(middle, -math.inf, math.inf, len(values))
-    if measure.kind == "fraction" and set(known) <= {0.0, 1.0}:
+    if (measure.kind == "fraction" or measure.is_fraction) and set(known) <= {0.0, 1.0}:
         return proportion(known)
     return interval(known)  # also for a fraction, once each sample has its mean over several seeds
 
@@ -85,7 +87,8 @@ def _list_plugin_measures() -> Iterator[Measure]:
     for plugin in discovery.load_plugins(discovery.METRIC):
         name = plugin.name()
         better = -1 if plugin.higher_is_better_for == "attacker" else 1
-        yield Measure(name, name.upper() if name in PAPER_METRICS else name, better, "mean", plugin.description())
+        label = label_identified() if name == IDENTIFIED else name.upper() if name in PAPER_METRICS else name
+        yield Measure(name, label, better, "mean", plugin.description(), is_fraction=plugin.unit == "fraction")
 
 
 def _parse_measure(name: str) -> Measure:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from bench.core.hashing import canonical_json
-from leaderboard.comparison import ComparisonGroup
+from leaderboard.comparison import ComparisonGroup, GroupedExperiment
 from leaderboard.figures import escape_text
 from leaderboard.intervals import Interval
 from leaderboard.measures import PRIVACY, list_measures
 from leaderboard.plot_style import PlotStyle, choose_styles, position_labels
-from leaderboard.ranking import Standing, rank_defenses
+from leaderboard.ranking import Standing, average_baselines, rank_defenses
+from leaderboard.signal import Verdict
 from leaderboard.tables import build_labels, format_setting
 from leaderboard.tradeoff import Tradeoff
 
@@ -21,6 +23,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 TRADEOFF = "tradeoff"  # prefix of the plots that the page draws itself
+HOLLOW = "hollow: no signal, or not tested"  # in legends
+SMALL, LARGE = 6.0, 9.0  # sizes of markers, in points
+BASELINE_LINES = ("-", (0, (1, 1.5)))  # line styles, in the order of the baselines
 BRIEF = 48  # maximum number of letters of a label
 ROW = 0.3  # inches per defense
 LETTER = 3.9, 9.0  # width and height of a letter of a label, in points
@@ -44,12 +49,13 @@ def draw_tradeoff(tradeoff: Tradeoff) -> Figure:
     figure, axes = _create_axes(7.2, 4.6, tradeoff.caption)
     for family, style in choose_family_styles(tradeoff).items():
         members = [point for point in tradeoff.points if point.standing.configuration["name"] == family]
-        for ranked, label in ((True, family), (False, f"{family}, unranked")):
-            at = [(point.utility, point.privacy) for point in members if (point.standing.rank is not None) == ranked]
-            _draw_points(axes, at, style, filled=ranked, label=label)
+        for label in dict.fromkeys(label_standing(point.standing, family) for point in members):
+            shown = [point for point in members if label_standing(point.standing, family) == label]
+            _draw_points(axes, [(point.utility, point.privacy) for point in shown], style, filled=label == family, label=label)
     # For a utility between two settings of the front, the least privacy loss is that of the more useful setting: a step.
     x, y = [point.utility.mean for point in tradeoff.front], [point.privacy.mean for point in tradeoff.front]
     axes.plot(x, y, color="0.35", lw=1, ls=(0, (4, 2)), drawstyle="steps-pre", zorder=1, label="Pareto front")
+    _draw_baselines(axes.axhline, tradeoff.baselines)
     axes.set_xlabel(f"{tradeoff.utility.label} →", fontsize=9)
     axes.set_ylabel(f"{tradeoff.privacy.label} of the strongest attack →", fontsize=9)
     axes.margins(0.12)
@@ -60,26 +66,32 @@ def draw_tradeoff(tradeoff: Tradeoff) -> Figure:
 
 
 def draw_attacks(group: ComparisonGroup, ranked: Sequence[Standing]) -> Figure:
-    """Draw the score of each attack on each defense, one line per defense, with intervals."""
+    """Draw the score of each attack on each defense, one line per defense, with intervals and the baselines as lines.
+
+    The marker of an attack without a signal is hollow, and that of the strongest attack on a defense is large.
+    """
     (privacy,) = list_measures([PRIVACY])
     experiments = [experiment for standing in ranked for experiment in standing.experiments]
     names = list(dict.fromkeys(experiment.attack for experiment in experiments if group.average(experiment, privacy)))
     height = ROW * len(ranked) * max(1.0, len(names) / 3)
     figure, axes = _create_axes(
-        9.0, 1.2 + height, f"{', '.join([group.title, *group.facts[:3]])}. Filled: the strongest attack on that defense"
+        9.0, 1.2 + height, f"{', '.join([group.title, *group.facts[:3]])}. Large: the strongest attack on that defense"
     )
     for index, (name, style) in enumerate(choose_styles(names).items()):
         offset = (index - (len(names) - 1) / 2) / (len(names) + 1)
-        for filled in (True, False):
+        for filled, large in itertools.product((True, False), repeat=2):
             at = [
                 (score, Interval(row + offset, -math.inf, math.inf, 1))
                 for row, standing in enumerate(ranked)
                 for experiment in standing.experiments
-                if experiment.attack == name and (experiment is standing.strongest) == filled
+                if experiment.attack == name and (experiment is standing.strongest) == large
+                if _has_signal(group, experiment) == filled
                 if (score := group.average(experiment, privacy))
             ]
-            _draw_points(axes, at, style, filled=filled, label=None)
-        axes.plot([], [], style.marker, color=style.colour, mfc="white", label=_shorten(name))
+            _draw_points(axes, at, style, filled=filled, label=None, size=LARGE if large else SMALL)
+        axes.plot([], [], style.marker, color=style.colour, label=_shorten(name))
+    axes.plot([], [], "o", color="0.35", mfc="white", label=HOLLOW)
+    _draw_baselines(axes.axvline, average_baselines(group))
     axes.set_yticks(range(len(ranked)), [_label_standing(standing) for standing in ranked], fontsize=8)
     axes.set_ylim(len(ranked) - 0.5, -0.5)
     axes.set_xlabel(f"{privacy.label} →", fontsize=9)
@@ -88,7 +100,7 @@ def draw_attacks(group: ComparisonGroup, ranked: Sequence[Standing]) -> Figure:
 
 
 def draw_epsilon(group: ComparisonGroup, curves: dict[str, list[Standing]]) -> Figure:
-    """Draw the score of the strongest attack over the ε of a descriptor."""
+    """Draw the score of the strongest attack over the ε of a descriptor. It is hollow where it has no signal."""
     (privacy,) = list_measures([PRIVACY])
     figure, axes = _create_axes(5.6, 3.6, ", ".join([group.title, *group.facts[:3]]))
     for (label, curve), style in zip(curves.items(), choose_styles(curves).values(), strict=True):
@@ -104,13 +116,27 @@ def draw_epsilon(group: ComparisonGroup, curves: dict[str, list[Standing]]) -> F
             lw=1.3,
             label=_shorten(label),
         )
+        hollow = [
+            (epsilon, score.mean) for epsilon, standing, score in zip(at, curve, scores, strict=True) if not standing.has_signal
+        ]
+        axes.plot([x for x, _ in hollow], [y for _, y in hollow], style.marker, color=style.colour, mfc="white", ms=5, zorder=3)
         low, high = [score.low for score in scores], [score.high for score in scores]
         if all(map(math.isfinite, low)):
             axes.fill_between(at, low, high, color=style.colour, alpha=0.12, lw=0)
+    if not all(standing.has_signal for curve in curves.values() for standing in curve):
+        axes.plot([], [], "o", color="0.35", mfc="white", label=HOLLOW)
+    _draw_baselines(axes.axhline, average_baselines(group))
     axes.set_xlabel("ε of a descriptor", fontsize=9)
     axes.set_ylabel(f"{privacy.label} of the strongest attack", fontsize=9)
     axes.legend(fontsize=7, frameon=False)
     return figure
+
+
+def label_standing(standing: Standing, family: str) -> str:
+    """Return the legend of a defense: its family, and why it has no rank."""
+    if standing.rank is not None:
+        return family
+    return f"{family}, {'no signal' if standing.signal and standing.signal.is_absent else 'unranked'}"
 
 
 def choose_family_styles(tradeoff: Tradeoff) -> dict[str, PlotStyle]:
@@ -132,10 +158,16 @@ def label_points(tradeoff: Tradeoff) -> list[str]:
 
 
 def _collect_curves(ranked: Sequence[Standing]) -> dict[str, list[Standing]]:
-    """Return groups of at least two settings that differ in ε alone, by their label without ε. Each is in the order of ε."""
+    """Return groups of at least two settings that differ in ε alone, by their label without ε. Each is in the order of ε.
+
+    A setting is in a group if it has a rank, or none only because its attacks have no signal.
+    """
     curves: dict[str, list[Standing]] = {}
     for standing in ranked:
-        if standing.rank is not None and math.isfinite(_get_epsilon(standing)):
+        has_curve = standing.rank is not None or (
+            standing.signal is not None and standing.unranked_reason == standing.signal.text
+        )
+        if has_curve and math.isfinite(_get_epsilon(standing)):
             fixed = {name: value for name, value in standing.configuration.items() if name != "epsilon"}
             curves.setdefault(build_labels([(fixed, None)])[0][0], []).append(standing)
     return {label: sorted(curve, key=_get_epsilon) for label, curve in curves.items() if len(set(map(_get_epsilon, curve))) > 1}
@@ -159,8 +191,25 @@ def _create_axes(width: float, height: float, title: str) -> tuple[Figure, Axes]
     return figure, axes
 
 
+def _has_signal(group: ComparisonGroup, experiment: GroupedExperiment) -> bool:
+    signal = group.signals.get(experiment)
+    return signal is not None and signal.verdict is Verdict.SIGNAL
+
+
+def _draw_baselines(draw_line: Callable[..., object], baselines: Mapping[str, float]) -> None:
+    """Draw the score of each baseline as a line across the axes, with a label for the legend."""
+    for (name, score), line in zip(baselines.items(), BASELINE_LINES, strict=False):
+        draw_line(score, color="0.35", lw=1, ls=line, zorder=1, label=f"baseline {name}")
+
+
 def _draw_points(
-    axes: Axes, at: Sequence[tuple[Interval, Interval]], style: PlotStyle, *, filled: bool, label: str | None
+    axes: Axes,
+    at: Sequence[tuple[Interval, Interval]],
+    style: PlotStyle,
+    *,
+    filled: bool,
+    label: str | None,
+    size: float = SMALL,
 ) -> None:
     """Draw the points, with thin lines for the intervals that are finite."""
     if not at:
@@ -174,7 +223,7 @@ def _draw_points(
         fmt=style.marker,
         color=style.colour,
         mfc=style.colour if filled else "white",
-        ms=6,
+        ms=size,
         lw=0.7,
         label=label and _shorten(label),
         zorder=3,

@@ -1,4 +1,9 @@
-"""Ranking of defenses, each by the strongest attack on it: the one with the greatest mean SSIM."""
+"""Ranking of defenses, each by the strongest attack on it.
+
+That is the attack with the greatest mean SSIM among the attacks with a signal, or among all attacks if none has a signal. A
+baseline is the strongest attack only where no other attack gave an image. No rank rests on an attack without a signal: the
+benchmark then cannot say how private the defense is.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +12,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from bench.core.hashing import canonical_json
 from leaderboard.comparison import ComparisonGroup, GroupedExperiment
 from leaderboard.intervals import Interval
 from leaderboard.measures import PRIVACY, Measure, list_measures
+from leaderboard.signal import BASELINES, Signal, Verdict, is_baseline
 
 ADAPTED = "dia"  # the attack whose network is trained for the defense; without it, a defense may look safe
 
@@ -24,7 +32,13 @@ class Standing:
     strongest: GroupedExperiment | None  # None if no attack reconstructed an image
     score: Interval | None  # of the strongest attack
     unranked_reason: str | None  # None for a ranked defense
+    signal: Signal | None  # of the strongest attack
     rank: int | None = None  # 1 is the most private; equal scores have equal ranks
+
+    @property
+    def has_signal(self) -> bool:
+        """Whether the score of the strongest attack is evidence."""
+        return self.signal is not None and self.signal.verdict is Verdict.SIGNAL
 
     @property
     def configuration(self) -> dict[str, Any]:
@@ -45,19 +59,38 @@ def rank_defenses(group: ComparisonGroup) -> list[Standing]:
     ]
 
 
+def average_baselines(group: ComparisonGroup, condition: str | None = None) -> dict[str, float]:
+    """Return the mean of `PRIVACY` of each baseline that was run, over the defenses that it was run on."""
+    (privacy,) = list_measures([PRIVACY])
+    scores: dict[str, list[float]] = {}
+    for experiment in group.experiments:
+        score = group.average(experiment, privacy, condition) if is_baseline(experiment.metadata) else None
+        if score:
+            scores.setdefault(experiment.metadata["attack"]["name"], []).append(score.mean)
+    return {name: float(np.mean(scores[name])) for name in BASELINES if name in scores}
+
+
 def _judge_defense(group: ComparisonGroup, experiments: Sequence[GroupedExperiment], privacy: Measure) -> Standing:
     scores = [(score, one) for one in experiments if (score := group.average(one, privacy)) is not None]
-    score, strongest = max(scores, key=lambda pair: pair[0].mean, default=(None, None))
+    score, strongest = max(scores, key=lambda pair: _strength(group.signals.get(pair[1]), pair[0]), default=(None, None))
+    signal = group.signals.get(strongest) if strongest else None
     return Standing(
         defense=experiments[0].defense,
         experiments=tuple(experiments),
         strongest=strongest,
         score=score,
-        unranked_reason=_explain_unranked(group, experiments, score),
+        unranked_reason=_explain_unranked(group, experiments, signal),
+        signal=signal,
     )
 
 
-def _explain_unranked(group: ComparisonGroup, experiments: Sequence[GroupedExperiment], score: Interval | None) -> str | None:
+def _strength(signal: Signal | None, score: Interval) -> tuple[bool, bool, float]:
+    """Return what attacks are ordered by: no baseline, a signal, the mean score."""
+    verdict = signal.verdict if signal else None
+    return verdict is not Verdict.BASELINE, verdict is Verdict.SIGNAL, score.mean
+
+
+def _explain_unranked(group: ComparisonGroup, experiments: Sequence[GroupedExperiment], signal: Signal | None) -> str | None:
     """Return the reason why a defense has no rank, or None if it has one."""
     adapted = [one for one in experiments if (one.metadata["attack"] or {}).get("name") == ADAPTED]
     if not adapted:
@@ -67,7 +100,9 @@ def _explain_unranked(group: ComparisonGroup, experiments: Sequence[GroupedExper
     for one in experiments:  # the completed samples may be the easy ones
         if group.count_missing(one):
             return f"{one.attack} has completed {len(group.complete_samples(one))} of {len(group.samples)} samples"
-    return None if score else "no attack reconstructed an image"
+    if signal is None:
+        return "no attack reconstructed an image"
+    return None if signal.verdict is Verdict.SIGNAL else signal.text
 
 
 def _mean_score(standing: Standing) -> float:

@@ -9,7 +9,7 @@ tolerance
 where s² is the variance between seeds within samples, pooled over the samples of both sides. n_u and n'_u are the numbers of
 seeds of sample u on either side, and U is the number of samples. t is a quantile of Student's distribution with the degrees
 of freedom of s: chance exceeds it in one of a thousand comparisons. With one seed on each side there is no such variance. The
-tolerance is then the bootstrap interval of the paired differences over samples, at the same level. The minimum covers
+tolerance is then Student's interval of the mean of the paired differences over samples, at the same level. The minimum covers
 differences between machines and between versions of libraries.
 """
 

@@ -13,9 +13,11 @@ from bench.core.table import NOT_APPLICABLE, Column, Row, Table
 from bench.mechanisms.composition import DELTA, UNCOVERED
 from bench.registry import discovery
 from bench.runner.records import Record, keep_latest
+from leaderboard.chance import IDENTIFIED, REMARK, label_identified
 
 if TYPE_CHECKING:
     from leaderboard.intervals import Interval
+    from leaderboard.signal import Signal
 
 Configuration = dict[str, Any] | None
 
@@ -94,7 +96,8 @@ def _build_table(records: list[Record], brief: bool, foldable: bool) -> Table:
     experiments = _group_by(records, lambda record: [record["defense"], record["attack"], record["run_hash"]])
     labels = build_labels([(records[0]["defense"], records[0]["attack"]) for records in experiments])
     metrics = _list_metrics(records)
-    rows = [_collect_values(*pair, metrics) for pair in zip(experiments, labels, strict=True)]
+    signals = _judge_signals(experiments)
+    rows = [_collect_values(*each, metrics) for each in zip(experiments, labels, signals, strict=True)]
     columns = {"defense": "defense", "attack": "attack", "photographs": "n"}
     if any(row["failed"] for row in rows):
         columns["failed"] = "failed"
@@ -106,7 +109,8 @@ def _build_table(records: list[Record], brief: bool, foldable: bool) -> Table:
         columns["note"] = "note"
     heading = _describe_samples(records)
     failures = _list_failures(experiments, labels)
-    remarks = [COMPOSITION_REMARK, SEED_REMARK]
+    chance = [REMARK] if IDENTIFIED in metrics else []
+    remarks = [*_list_signal_remarks(signals), COMPOSITION_REMARK, SEED_REMARK]
     return Table(
         heading=heading,
         columns=tuple(Column(label=label, text=name in ("defense", "attack", "note")) for name, label in columns.items()),
@@ -118,7 +122,7 @@ def _build_table(records: list[Record], brief: bool, foldable: bool) -> Table:
             )
             for row in rows
         ),
-        remarks=(*failures, *remarks) if brief else (*_explain_metrics(metrics), *remarks, *failures),
+        remarks=(*failures, *chance, *remarks) if brief else (*_explain_metrics(metrics), *chance, *remarks, *failures),
         note_column=1,  # the attack
     )
 
@@ -134,7 +138,28 @@ def _describe_samples(records: list[Record]) -> str:
     )
 
 
-def _collect_values(records: list[Record], labels: tuple[str, str], metrics: Sequence[str]) -> dict[str, Any]:
+def _judge_signals(experiments: Sequence[list[Record]]) -> list[Signal | None]:
+    """Return the signal of each experiment; None for the experiments of tasks that return no image."""
+    if not any(record["attack"] and record["metrics"] for records in experiments for record in records):
+        return [None] * len(experiments)
+    from leaderboard.signal import judge_experiments  # expensive: imports scipy
+
+    return judge_experiments(experiments)
+
+
+def _list_signal_remarks(signals: Sequence[Signal | None]) -> list[str]:
+    """Return the remarks on the rule, and on the baselines that are missing."""
+    if not any(signals):
+        return []
+    from leaderboard.signal import REMARK, explain_untested  # expensive: imports scipy
+
+    untested = explain_untested(signals)
+    return [REMARK, *([untested] if untested else [])]
+
+
+def _collect_values(
+    records: list[Record], labels: tuple[str, str], signal: Signal | None, metrics: Sequence[str]
+) -> dict[str, Any]:
     """Return the values of an experiment's row by name. Values that do not apply are None."""
     completed = [record for record in records if record["status"] == "ok"]
     applies, privacy = records[0]["status"] != "n/a", records[0]["privacy"]
@@ -150,7 +175,8 @@ def _collect_values(records: list[Record], labels: tuple[str, str], metrics: Seq
         "epsilon_descriptor": _to_float(privacy["epsilon_descriptor"]),
         "epsilon_image": _median(spent_epsilon(record["privacy"]) for record in completed),
         "log10_true": _to_float(privacy["log10_true"]),
-        "note": "; ".join(_list_notes(records, completed)),
+        "signal": signal.text if signal else None,
+        "note": "; ".join(_list_notes(records, completed, signal)),
     }
 
 
@@ -169,16 +195,22 @@ def _format_value(name: str, value: Any, foldable: bool) -> str:
 def _label_metric(name: str) -> str:
     if name in PAPER_METRICS:
         return name.upper()
+    if name == IDENTIFIED:
+        return label_identified()
     return f"median {name}" if name in MEDIAN_METRICS else name
 
 
 def _explain_metrics(metrics: Sequence[str]) -> list[str]:
     plugins = {plugin.name(): plugin for plugin in discovery.load_plugins(discovery.METRIC)}
-    return [f"{name}: {plugins[name].description()}" for name in metrics if name in plugins]
+    chance = [REMARK] if IDENTIFIED in metrics else []
+    return [*(f"{name}: {plugins[name].description()}" for name in metrics if name in plugins and name != IDENTIFIED), *chance]
 
 
-def _list_notes(records: list[Record], completed: list[Record]) -> list[str]:
-    """Return the reason why the experiment does not apply, or the notes that hold for all its samples."""
+def _list_notes(records: list[Record], completed: list[Record], signal: Signal | None) -> list[str]:
+    """Return the reason why the experiment does not apply, or that it has no signal and the notes that hold for all its samples.
+
+    The reason why an experiment was not tested for a signal is in the table's remarks.
+    """
     if records[0]["status"] == "n/a":
         return [records[0]["reason"]]
     if not completed:
@@ -188,7 +220,8 @@ def _list_notes(records: list[Record], completed: list[Record]) -> list[str]:
     beyond = [f"also not covered: {', '.join(uncovered)}"] if uncovered else []
     by_distance = records[0]["privacy"].get("epsilon_per_distance")
     other = [] if by_distance is None else [f"not ε-LDP: ε = {format_number(by_distance)} per unit of distance"]
-    return [*other, *shared, *beyond]
+    at_baseline = [signal.text] if signal and signal.is_absent else []
+    return [*at_baseline, *other, *shared, *beyond]
 
 
 def _list_failures(experiments: Sequence[list[Record]], labels: Sequence[tuple[str, str]]) -> list[str]:

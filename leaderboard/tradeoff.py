@@ -13,7 +13,7 @@ from bench.core.hashing import canonical_json
 from leaderboard.comparison import ComparisonGroup, GroupedExperiment
 from leaderboard.intervals import Interval
 from leaderboard.measures import PRIVACY, UTILITY, Measure, list_measures
-from leaderboard.ranking import Standing, rank_defenses
+from leaderboard.ranking import Standing, average_baselines, rank_defenses
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -39,6 +39,7 @@ class Tradeoff:
     privacy: Measure
     utility: Measure
     points: tuple[Point, ...]
+    baselines: Mapping[str, float]  # name -> its mean privacy score
 
     @property
     def caption(self) -> str:
@@ -121,6 +122,7 @@ def _build_tradeoff(
         privacy=privacy,
         utility=utility,
         points=points,
+        baselines=average_baselines(attack_group, privacy_condition),
     )
 
 

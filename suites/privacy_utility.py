@@ -1,5 +1,6 @@
 """Reconstruction and localization of the same queries, with the same images, words, ε and m."""
 
+from attacks.blank import Blank
 from attacks.dia import DIA
 from attacks.keypoints import Keypoints
 from attacks.lattice import Lattice
@@ -25,7 +26,7 @@ SUITE = Suite(
             *(LDP(epsilon=epsilon, dictionary=Asset("shipped")) for epsilon in EPSILONS),
             *(LDP(epsilon=10, subset_size=size, dictionary=Asset("shipped")) for size in SIZES if size != LDP.subset_size),
         ],
-        attacks=[DIA(), Lattice(), Keypoints()],
+        attacks=[DIA(), Lattice(), Blank(), Keypoints()],
         tasks=[Reconstruction(), Localization()],
         datasets=[Gallery(queries=50, night=0.0)],
     ),

@@ -1,8 +1,10 @@
 """Effect of each defense's settings against attackers that know them, over seeds to show the random variation."""
 
+from attacks.blank import Blank
 from attacks.context import Context
 from attacks.database import Database
 from attacks.dia import DIA
+from attacks.keypoints import Keypoints
 from attacks.lattice import Lattice
 from bench.runner.suite import Suite, grid
 from defenses.affine import Affine
@@ -21,7 +23,7 @@ SUITE = Suite(
             *(Affine(dim=dim) for dim in DIMS),
             *(LDP(epsilon=epsilon, subset_size=size) for epsilon in EPSILONS for size in SIZES),
         ],
-        attacks=[DIA(), Context(), Database(), Lattice()],
+        attacks=[DIA(), Context(), Database(), Lattice(), Blank(), Keypoints()],
         seeds=range(3),
     ),
 )

@@ -1,5 +1,6 @@
 """A run of a few seconds: one defense per kind of release, and the fastest attacks."""
 
+from attacks.blank import Blank
 from attacks.dia import DIA
 from attacks.keypoints import Keypoints
 from attacks.nearest import Nearest
@@ -13,7 +14,7 @@ SUITE = Suite(
     summary="one photograph, in seconds: a check of the installation",
     parts=grid(
         defenses=[Undefended(), Affine(), LDP()],
-        attacks=[Keypoints(), DIA(), Nearest()],
+        attacks=[Blank(), Keypoints(), DIA(), Nearest()],
         images=[source for source in photographs.list_builtin() if source.name == "rocket"],  # the one with the fewest keypoints
     ),
 )

@@ -49,3 +49,35 @@ def test_a_difference_is_found(part: str) -> None:
     assert list(golden_record.find_differences(before, before)) == []
     (message,) = golden_record.find_differences(before, after)
     assert part in message
+
+
+def test_a_new_attack_or_metric_is_no_difference() -> None:
+    before = golden_record.read(RECORD)[1]
+    after = copy.deepcopy(before)
+    changed = next(line for line in after if line.get("metrics") and line["attack"])
+    changed["metrics"]["another"] = 0.5
+    after.append(changed | {"attack": {"name": "another"}})
+    assert list(golden_record.find_differences(before, after)) == []
+
+
+def test_what_is_gone_is_a_difference() -> None:
+    """An attack, a metric, a value of a metric. Cases that are not measured are not compared."""
+    before = golden_record.read(RECORD)[1]
+    number, line = next((number, line) for number, line in enumerate(before) if line.get("metrics"))
+    without_line = before[:number] + before[number + 1 :]
+    (message,) = golden_record.find_differences(before, without_line)
+    assert message == f"{golden_record.label(line)}: is gone"
+    without_metric = copy.deepcopy(before)
+    del without_metric[number]["metrics"][next(iter(line["metrics"]))]
+    (message,) = golden_record.find_differences(before, without_metric)
+    assert "metrics was" in message
+    without_value = copy.deepcopy(before)
+    without_value[number]["metrics"] = dict.fromkeys(line["metrics"])
+    assert len(list(golden_record.find_differences(before, without_value))) == 1
+    other_cases = [other for other in before if other["case"] != line["case"]]
+    assert list(golden_record.find_differences(before, other_cases)) == []
+
+
+def test_cases_differ_in_what_lines_name() -> None:
+    keys = [(case.task, case.extractor, case.dataset) for case in CASES]
+    assert len(set(keys)) == len(keys)

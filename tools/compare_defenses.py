@@ -229,7 +229,7 @@ def write_heading(study: Study, alone: np.ndarray) -> str:
         "descriptors; **recovered**: the fraction of descriptors that it finds. It selects the most frequent word, which is the "
         "likeliest for `ldp` alone.\n\n"
         "n/a: no network was trained for that defense, or it releases no words, which `repeat` needs. "
-        "In brackets: 95% bootstrap over photographs, or Wilson's interval over queries.\n"
+        "In brackets: 95% intervals, Student's over photographs or Wilson's over queries.\n"
     )
 
 

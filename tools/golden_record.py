@@ -3,7 +3,8 @@
     python tools/golden_record.py write tests/data/golden.jsonl     # on the code before a change
     python tools/golden_record.py check tests/data/golden.jsonl     # on the code after it, on the same machine
 
-A release must be the same to the last bit, and a score within 1e-6. Digests of our own source, which enter the keys of rendered
+A release must be the same to the last bit, and a score within 1e-6. Attacks and metrics that the file lacks are new, and are not
+compared; those that are gone are differences. Digests of our own source, which enter the keys of rendered
 images and of a scene's dictionary, are held constant, so that a change of names is no change of content. Other processors and
 libraries round differently: the first line holds both, and `check` says so where they differ.
 """
@@ -164,13 +165,33 @@ def digest(release: Release) -> str:
 
 
 def find_differences(before: Sequence[dict[str, Any]], after: Iterable[dict[str, Any]]) -> Iterator[str]:
-    """Yield a message for each difference of a line after the change to the line before it with the same label."""
+    """Yield a message for each difference of a line after the change to the line before it with the same label.
+
+    Lines of new attacks and values of new metrics have none before the change, and are left out. A line that is gone is reported,
+    if another line of its case is there.
+    """
     known = {label(line): line for line in before}
+    attacks = {_name_attack(line) for line in before}
+    measured, measured_cases = set(), set()
     for new in after:
+        measured.add(label(new))
+        measured_cases.add(json.dumps(new["case"]))
+        if _name_attack(new) not in attacks:
+            continue
         old = known.get(label(new), {})
         for name in sorted(old.keys() | new.keys()):
-            if not close(old.get(name), new.get(name)):
-                yield f"{label(new)}: {name} was {old.get(name)}, is {new.get(name)}"
+            value = new.get(name)
+            if name == "metrics" and name in old:
+                value = {metric: value[metric] for metric in value if metric in old[name]}
+            if not close(old.get(name), value):
+                yield f"{label(new)}: {name} was {old.get(name)}, is {value}"
+    for line in before:
+        if json.dumps(line["case"]) in measured_cases and label(line) not in measured:
+            yield f"{label(line)}: is gone"
+
+
+def _name_attack(line: dict[str, Any]) -> str | None:
+    return line["attack"] and line["attack"]["name"]
 
 
 def label(line: dict[str, Any]) -> str:

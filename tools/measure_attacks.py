@@ -46,7 +46,7 @@ from leaderboard.intervals import interval
 TITLE = """# Results of every attack
 
 The releases are of the seven built-in photographs: all keypoints, upright SIFT, seed 0. The attacks have their default settings,
-[chosen on other photographs](tuning.md). In brackets: 95% intervals, by percentile bootstrap over photographs.
+[chosen on other photographs](tuning.md). In brackets: 95% intervals of Student's t over photographs.
 """
 DIMS = (2, 4, 8, 16)
 SUBSPACES = tuple(f"affine:dim={dim}" for dim in DIMS)

@@ -95,7 +95,7 @@ def write_heading(study: Study) -> str:
         f"All networks have the channels of the shipped ones ({WIDTHS}). They are trained on the same {study.trained_on} "
         "photographs, in batches of 8 samples. **That is a small budget**: compare networks that were trained equally long, "
         "and do not rely on their absolute quality. A difference may grow or vanish with longer training. In brackets: 95% "
-        "intervals, by bootstrap over photographs, the 100 of `test.txt` and the 7 built-in ones, which no "
+        "intervals of Student's t over photographs, the 100 of `test.txt` and the 7 built-in ones, which no "
         "network was trained or chosen on. Differences are paired by photograph; a network is *better* if the interval "
         "on `test.txt` lies above 0. Each was trained once; intervals do not include the variation between seeds. Additional "
         "input does not reduce leakage: a network with more input and a worse result has not learned to use it.\n"

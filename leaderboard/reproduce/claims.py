@@ -2,8 +2,10 @@
 
 A claim is a list of statements. A table entry is the mean over samples, such as photographs, of a measure in a row. A
 statement says that a linear combination of entries lies in an open interval. For example, "A > B" says that A − B lies in (0,
-∞). The verdict depends on the bootstrap interval of that combination, paired by sample. The statement holds if this interval
-lies inside the open interval, and fails if it lies outside. Otherwise the verdict is "cannot tell".
+∞). Student's t of that combination, paired by sample, tests both that it lies inside and that it lies outside. The p-value is
+twice the smaller one of the two, with Holm's correction over the statements of the claim. The statement holds or fails if it is
+at most `SIGNIFICANCE`. Otherwise the verdict is "cannot tell". It is also "cannot tell" if a row of the statement has no signal
+(`leaderboard/signal.py`), because its entries say nothing about the defense.
 """
 
 from __future__ import annotations
@@ -13,15 +15,15 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from types import MappingProxyType
 
 import pandas as pd
 
-from leaderboard.intervals import Interval, combine_independent, interval
+from leaderboard.intervals import LEVEL, MIN_SAMPLES, Estimate, Interval, combine_independent, correct_holm, estimate_mean
 
 TableEntry = tuple[str, str]  # a row's name, a measure
 
-# With fewer samples, even equal signs of all differences are no evidence at 95%: five have p = 2 · 2^-5.
-MIN_SAMPLES = 6
+SIGNIFICANCE = 1 - LEVEL  # of the statements of a claim together, two-sided
 
 
 class Verdict(Enum):
@@ -40,7 +42,7 @@ class Statement:
     weights: Mapping[TableEntry, float]
     above: float = -math.inf
     below: float = math.inf
-    paired: bool = True  # whether its entries have the same samples; otherwise each entry is resampled by itself
+    paired: bool = True  # whether its entries have the same samples; otherwise the entries are independent
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +61,8 @@ class Evidence:
     paper: float | None
     ours: Interval | None  # None if no sample has all entries
     verdict: Verdict
-    reason: str = ""  # for `OPEN`, if there is another reason than the interval
+    p_value: float | None = None  # corrected; None for a statement that was not tested
+    reason: str = ""  # for `OPEN`, why it was not tested
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,7 +116,11 @@ def same_order(paper: Mapping[TableEntry, float], min_difference: float, measure
 
 
 def judge_claims(
-    claims: Iterable[Claim], values: pd.DataFrame, paper: Mapping[TableEntry, float], reasons: Mapping[str, str]
+    claims: Iterable[Claim],
+    values: pd.DataFrame,
+    paper: Mapping[TableEntry, float],
+    reasons: Mapping[str, str],
+    no_evidence: Mapping[str, str] = MappingProxyType({}),
 ) -> tuple[ClaimResult, ...]:
     """Return each claim with its evidence.
 
@@ -122,45 +129,78 @@ def judge_claims(
     values : a column for each entry, a row for each sample; missing values are NaN
     paper : the printed value of each entry
     reasons : name of a row without values -> the reason
+    no_evidence : name of a row whose attack has no signal, or was not tested for one -> the reason
     """
-    return tuple(
-        ClaimResult(
-            claim=claim, evidence=tuple(_evaluate_statement(statement, values, paper, reasons) for statement in claim.statements)
-        )
-        for claim in claims
+    return tuple(_judge_claim(claim, values, paper, reasons, no_evidence) for claim in claims)
+
+
+def _judge_claim(
+    claim: Claim,
+    values: pd.DataFrame,
+    paper: Mapping[TableEntry, float],
+    reasons: Mapping[str, str],
+    no_evidence: Mapping[str, str],
+) -> ClaimResult:
+    estimates = [_estimate(statement, values) for statement in claim.statements]
+    obstacles = [
+        _explain_untested(statement, estimate, reasons, no_evidence)
+        for statement, estimate in zip(claim.statements, estimates, strict=True)
+    ]
+    tests = {
+        index: _test(claim.statements[index], estimate)
+        for index, estimate in enumerate(estimates)
+        if estimate is not None and not obstacles[index]
+    }
+    corrected = dict(zip(tests, correct_holm([p_value for _, p_value in tests.values()]).tolist(), strict=True))
+    return ClaimResult(
+        claim=claim,
+        evidence=tuple(
+            Evidence(
+                statement=statement,
+                paper=_combine_printed(statement, paper),
+                ours=estimate.interval() if estimate else None,
+                verdict=tests[index][0] if index in tests and corrected[index] <= SIGNIFICANCE else Verdict.OPEN,
+                p_value=corrected.get(index),
+                reason=obstacles[index],
+            )
+            for index, (statement, estimate) in enumerate(zip(claim.statements, estimates, strict=True))
+        ),
     )
 
 
-def _evaluate_statement(
-    statement: Statement, values: pd.DataFrame, paper: Mapping[TableEntry, float], reasons: Mapping[str, str]
-) -> Evidence:
+def _combine_printed(statement: Statement, paper: Mapping[TableEntry, float]) -> float | None:
     weights = statement.weights
-    printed = sum(weight * paper[entry] for entry, weight in weights.items()) if weights.keys() <= paper.keys() else None
+    return sum(weight * paper[entry] for entry, weight in weights.items()) if weights.keys() <= paper.keys() else None
+
+
+def _estimate(statement: Statement, values: pd.DataFrame) -> Estimate | None:
+    """Return the estimated combination; None if no sample has all of its entries."""
+    weights = statement.weights
     if not statement.paired:
         columns = [values[entry].dropna() if entry in values else pd.Series(dtype=float) for entry in weights]
         if all(map(len, columns)):
-            return _make_evidence(statement, printed, combine_independent(columns, list(weights.values())))
+            return combine_independent(columns, list(weights.values()))
     complete = values.reindex(columns=pd.MultiIndex.from_tuples(weights)).dropna()  # (samples, entries)
-    if complete.empty:
-        missing = dict.fromkeys(row for row, _ in weights if row in reasons)
-        reason = "; ".join(f"{row}: {reasons[row]}" for row in missing) or "no sample has all of these entries"
-        return Evidence(statement=statement, paper=printed, ours=None, verdict=Verdict.OPEN, reason=reason)
-    return _make_evidence(statement, printed, interval(complete.to_numpy() @ list(weights.values())))
+    return None if complete.empty else estimate_mean(complete.to_numpy() @ list(weights.values()))
 
 
-def _make_evidence(statement: Statement, printed: float | None, ours: Interval) -> Evidence:
-    if ours.count < MIN_SAMPLES:
-        reason = f"{ours.count} samples; at least {MIN_SAMPLES} are needed"
-        return Evidence(statement=statement, paper=printed, ours=ours, verdict=Verdict.OPEN, reason=reason)
-    return Evidence(statement=statement, paper=printed, ours=ours, verdict=_decide_verdict(statement, ours))
+def _explain_untested(
+    statement: Statement, estimate: Estimate | None, reasons: Mapping[str, str], no_evidence: Mapping[str, str]
+) -> str:
+    """Return why a statement cannot be tested; "" if it can."""
+    rows = dict.fromkeys(row for row, _ in statement.weights)
+    if estimate is None:
+        return "; ".join(f"{row}: {reasons[row]}" for row in rows if row in reasons) or "no sample has all of these entries"
+    if estimate.count < MIN_SAMPLES:
+        return f"{estimate.count} samples; at least {MIN_SAMPLES} are needed"
+    return "; ".join(f"{row}: {no_evidence[row]}" for row in rows if row in no_evidence)
 
 
-def _decide_verdict(statement: Statement, ours: Interval) -> Verdict:
-    if ours.low > statement.above and ours.high < statement.below:
-        return Verdict.HOLDS
-    if ours.high < statement.above or ours.low > statement.below:
-        return Verdict.FAILS
-    return Verdict.OPEN
+def _test(statement: Statement, estimate: Estimate) -> tuple[Verdict, float]:
+    """Return the verdict that the estimate speaks for, and its two-sided p-value before correction."""
+    holds = max(estimate.p_above(statement.above), estimate.p_below(statement.below))  # both ends must be rejected
+    fails = min(estimate.p_below(statement.above), estimate.p_above(statement.below))
+    return (Verdict.HOLDS, min(1.0, 2 * holds)) if holds < fails else (Verdict.FAILS, min(1.0, 2 * fails))
 
 
 def _format_entry(entry: TableEntry) -> str:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from bench.core import table as tables
 from bench.registry import spec
+from leaderboard import chance, signal
 from leaderboard.intervals import LEVEL, Interval
 from leaderboard.reproduce import run
 from leaderboard.reproduce.claims import ClaimResult, Evidence, Verdict
@@ -22,12 +23,13 @@ from leaderboard.tables import SEED_REMARK, label_extractor
 if TYPE_CHECKING:
     from rich.table import Table as RichTable
 
+LEAST_P_VALUE = 0.001  # smaller ones are not written out
 DIGITS = 4  # of the numbers in the evidence
 FULL_LIST_LIMIT = 12  # a claim with more statements lists only those that fail or stay open
 TERMINAL_LIMIT = 12  # statements per claim in a terminal
 INTERVALS = (
-    f"In brackets: {LEVEL:.0%} intervals, by percentile bootstrap over photographs, queries or seeds; Wilson's for fractions. A "
-    "verdict rests on the bootstrap of the paired combination."
+    f"In brackets: {LEVEL:.0%} intervals of Student's t over photographs, queries or seeds; Wilson's for fractions. A verdict "
+    "rests on Student's t of the combination, paired by sample. Its p-value has Holm's correction over the claim's statements."
 )
 
 
@@ -97,13 +99,17 @@ def compare_values(table: ReproducedTable) -> tables.Table:
     printed = {measure for row in table.result.rows for measure in row.paper}
     rows = [_format_row(row, table, printed) for row in table.result.rows]
     labels = list(dict.fromkeys(label for row in rows for label in row))
+    if table.signals:
+        labels.append("signal")
+        words = [table.signals[row.name].word if row.name in table.signals else "n/a" for row in table.result.rows]
+        rows = [values | {"signal": word} for values, word in zip(rows, words, strict=True)]
     if any(table.notes.values()):
         labels.append("note")
         rows = [values | {"note": table.notes[row.name]} for values, row in zip(rows, table.result.rows, strict=True)]
     return tables.build_table(
         labels,
         [[row.get(label, "") for label in labels] for row in rows],
-        text=("attack", "note"),
+        text=("attack", "signal", "note"),
         heading=format_heading(table),
         remarks=list_remarks(table),
     )
@@ -120,6 +126,7 @@ def tabulate_values(table: ReproducedTable) -> list[dict[str, Any]]:
             **_interval_to_json(table.ours.get((row.name, measure))),
             "experiment_id": " ".join(table.result.experiment_ids[row.name]),
             "note": table.notes[row.name],
+            "signal": _describe_signal(table, row),
         }
         for row in table.result.rows
         for measure in table.definition.measures
@@ -171,6 +178,11 @@ def list_remarks(table: ReproducedTable) -> list[str]:
     if table.correlation is not None:
         measure = definition.rank_measure
         lines = [f"Spearman's rank correlation of the paper's and our {measure}, over its rows: {table.correlation:.3f}."]
+    if table.signals:
+        untested = signal.explain_untested(list(table.signals.values()))
+        lines += [signal.REMARK, *([untested] if untested else [])]
+    if any(measure.metric == chance.IDENTIFIED for measure in definition.measures.values()):
+        lines.append(chance.REMARK)
     return [*lines, *definition.notes, INTERVALS, SEED_REMARK]
 
 
@@ -195,8 +207,13 @@ _PLURAL = {Verdict.HOLDS: "hold", Verdict.FAILS: "do not hold", Verdict.OPEN: "c
 def _format_evidence(evidence: Evidence) -> str:
     paper = "" if evidence.paper is None else f"paper {evidence.paper:.{DIGITS}g}, "
     ours = "nothing measured" if evidence.ours is None else f"ours {_format_interval(evidence.ours, DIGITS, 'g')}"
+    p_value = "" if evidence.p_value is None else f", {_format_p_value(evidence.p_value)}"
     reason = f" ({evidence.reason})" if evidence.reason else ""
-    return f"{evidence.verdict.value}: {evidence.statement.text}: {paper}{ours}{reason}"
+    return f"{evidence.verdict.value}: {evidence.statement.text}: {paper}{ours}{p_value}{reason}"
+
+
+def _format_p_value(value: float) -> str:
+    return f"p < {LEAST_P_VALUE:g}" if value < LEAST_P_VALUE else f"p = {value:.2g}"
 
 
 def _format_row(row: Row, table: ReproducedTable, printed: Container[str]) -> dict[str, str]:
@@ -232,7 +249,12 @@ def _row_to_json(row: Row, table: ReproducedTable) -> dict[str, Any]:
         "task": spec.to_json(row.task),
         "cell_ids": list(table.result.experiment_ids[row.name]),
         "note": table.notes[row.name],
+        "signal": _describe_signal(table, row),
     }
+
+
+def _describe_signal(table: ReproducedTable, row: Row) -> str | None:
+    return table.signals[row.name].text if row.name in table.signals else None
 
 
 def _evidence_to_json(evidence: Evidence) -> dict[str, Any]:
@@ -243,6 +265,7 @@ def _evidence_to_json(evidence: Evidence) -> dict[str, Any]:
         "below": spec.encode_infinity(statement.below),
         "paper": evidence.paper,
         **_interval_to_json(evidence.ours),
+        "p_value": evidence.p_value,
         "verdict": evidence.verdict.value,
         "reason": evidence.reason,
     }

@@ -25,6 +25,7 @@ from leaderboard.reproduce import study
 from leaderboard.reproduce.claims import ClaimResult, TableEntry, judge_claims
 from leaderboard.reproduce.profiles import Profile, Setting
 from leaderboard.reproduce.study import Measure, Row, Table
+from leaderboard.signal import Signal, judge_experiments
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -66,6 +67,7 @@ class ReproducedTable:
     notes: Mapping[str, str]  # row's name -> why it has no values, or remarks on them
     correlation: float | None  # Spearman's, without reference rows
     claim_results: tuple[ClaimResult, ...]
+    signals: Mapping[str, Signal]  # of the rows whose attack returns images
 
 
 def select_photographs(images: Path | None, profile: Profile, limit: int) -> EvaluationSet:
@@ -164,6 +166,8 @@ def compare_with_paper(table: Table, setting: Setting, evaluation_set: Evaluatio
     reasons = {row.name: reason for row in result.rows if (reason := _explain_missing(select_records(result, row.name)))}
     columns = _collect_values(table, result)
     paper = study.collect_paper_values(result.rows)
+    signals = _judge_signals(result)
+    no_evidence = {row: signal.text for row, signal in signals.items() if signal.is_absent or signal.is_untested}
     ours = {entry: _compute_interval(table.measures[entry[1]], column) for entry, column in columns.items() if len(column)}
     return ReproducedTable(
         definition=table,
@@ -173,7 +177,8 @@ def compare_with_paper(table: Table, setting: Setting, evaluation_set: Evaluatio
         ours=ours,
         notes={row.name: reasons.get(row.name) or _summarize_notes(select_records(result, row.name)) for row in result.rows},
         correlation=_correlate_ranks(table, table.build_rows(setting), ours),
-        claim_results=judge_claims(table.build_claims(paper), pd.DataFrame(columns), paper, reasons),
+        claim_results=judge_claims(table.build_claims(paper), pd.DataFrame(columns), paper, reasons, no_evidence),
+        signals=signals,
     )
 
 
@@ -190,6 +195,13 @@ def list_records(result: RunResult) -> list[Record]:
 def count_failures(result: RunResult) -> int:
     """Return the number of failed records."""
     return sum(record["status"] == "failed" for record in list_records(result))
+
+
+def _judge_signals(result: RunResult) -> dict[str, Signal]:
+    records = {row.name: select_records(result, row.name) for row in result.rows}
+    known = {name: each for name, each in records.items() if each}
+    signals = zip(known, judge_experiments(list(known.values())), strict=True)
+    return {name: signal for name, signal in signals if signal is not None}
 
 
 def _get_value(measure: Measure, record: Record) -> float | None:

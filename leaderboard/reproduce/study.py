@@ -15,6 +15,7 @@ from bench.task_api import Task
 from bench.tasks.reconstruction import Reconstruction
 from leaderboard.reproduce.claims import Claim, TableEntry
 from leaderboard.reproduce.profiles import Profile, Setting
+from leaderboard.signal import BASELINES
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -61,7 +62,7 @@ class Table:
     extractor: Callable[[Profile], Extractor] = lambda profile: Sift()  # the default
     multiple_seeds: bool = False  # as many seeds as the profile has; otherwise one
     rank_measure: str | None = None  # the measure whose rank correlation with the paper's is reported
-    # Rows of other tables that claims compare with.
+    # Baselines, and rows of other tables that claims compare with.
     build_reference_rows: Callable[[Setting], tuple[Row, ...]] = field(default=lambda setting: ())
     draw: Callable[[FigureData], Iterator[tuple[str, Figure]]] | None = None  # yields its figures, as `Drawing.draw` does
     notes: tuple[str, ...] = ()
@@ -76,6 +77,25 @@ def build_reconstruction(setting: Setting) -> Reconstruction:
     """Return the task of Tables 1 and 4: the network for raw descriptors inverts the recovered ones."""
     network = setting.materials.raw_network
     return Reconstruction() if network == Asset("shipped") else Reconstruction(inverter=f"dia:weights={network}")
+
+
+def build_baseline_rows(task: Task) -> tuple[Row, ...]:
+    """Return the rows of the baselines of a table of reconstructions, on features without a defense.
+
+    They serve every defense that releases the positions in the clear (`leaderboard/signal.py`).
+    """
+    undefended = build_plugin(discovery.DEFENSE, "none", {})
+    return tuple(
+        Row(
+            name=name,
+            labels={"attack": name},
+            paper={},
+            defense=undefended,
+            attack=build_plugin(discovery.ATTACK, name, {}),
+            task=task,
+        )
+        for name in BASELINES
+    )
 
 
 def build_plugin(kind: Kind[P], name: str, configuration: Mapping[str, Any], optional: Mapping[str, Any] | None = None) -> P:

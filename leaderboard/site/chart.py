@@ -49,6 +49,7 @@ class Chart:
     up: tuple[Tick, ...]
     front: str  # the d of an SVG path
     legend: tuple[tuple[str, PlotStyle], ...]
+    baselines: tuple[Tick, ...]  # their scores
     width: int = WIDTH
     height: int = HEIGHT
     box: tuple[int, int, int, int] = (LEFT, TOP, WIDTH - RIGHT, HEIGHT - BOTTOM)  # left, top, right, bottom of the plot
@@ -82,7 +83,9 @@ def build_charts(tradeoffs: Sequence[Tradeoff]) -> list[Chart]:
     if not points:
         return []
     x = _fit_scale([point.utility for point in points], LEFT, WIDTH - RIGHT)
-    y = _fit_scale([point.privacy for point in points], HEIGHT - BOTTOM, TOP)
+    baselines = [score for tradeoff in tradeoffs for score in tradeoff.baselines.values()]
+    levels = [Interval(score, -math.inf, math.inf, 1) for score in baselines]
+    y = _fit_scale([*(point.privacy for point in points), *levels], HEIGHT - BOTTOM, TOP)
     return [_build_chart(tradeoff, x, y) for tradeoff in tradeoffs]
 
 
@@ -116,6 +119,7 @@ def _build_chart(tradeoff: Tradeoff, x: Scale, y: Scale) -> Chart:
         up=y.ticks(),
         front=_draw_front(tradeoff.front, x, y),
         legend=tuple(styles.items()),
+        baselines=tuple(Tick(position=y(score), text=name) for name, score in tradeoff.baselines.items()),
     )
 
 
@@ -148,7 +152,7 @@ def _draw_front(front: Sequence[Point], x: Scale, y: Scale) -> str:
 
 def _describe(tradeoff: Tradeoff, point: Point) -> str:
     standing = point.standing
-    rank = f"rank {standing.rank}" if standing.rank is not None else "unranked"
+    rank = f"rank {standing.rank}" if standing.rank is not None else f"unranked: {standing.unranked_reason}"
     return (
         f"{standing.defense}, {rank}: {tradeoff.utility.label} {format_number(point.utility.mean)}, "
         f"{tradeoff.privacy.label} {format_number(point.privacy.mean)} by {point.attack_experiment.attack}"

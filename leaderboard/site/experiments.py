@@ -62,7 +62,7 @@ class View:
 
 def select_columns(table: GroupTable) -> list[GroupColumn]:
     """Return the columns of the page's table: the judged measures, and what identifies a row."""
-    names = ("rank", "defense", "guarantee", "epsilon_descriptor", "epsilon_image", "attack", "units")
+    names = ("rank", "defense", "guarantee", "epsilon_descriptor", "epsilon_image", "attack", "signal", "units")
     return [column for column in table.columns if column.name in names or (column.better and column.name not in HIDDEN_COLUMNS)]
 
 

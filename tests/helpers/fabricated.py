@@ -91,6 +91,15 @@ def reconstructions(defense: dict[str, Any], scores: Sequence[float], **more: An
     ]
 
 
+def baselines(defense: dict[str, Any], count: int, score: float = 0.002, **more: Any) -> list[dict[str, Any]]:
+    """Return the records of both baselines with this SSIM on `count` samples. They serve the other defenses as well."""
+    return [
+        one
+        for name in ("blank", "keypoints")
+        for one in reconstructions(defense, [score] * count, **{"attack": {"name": name}, **more})
+    ]
+
+
 def localizations(
     defense: dict[str, Any], hits: Sequence[int], conditions: Sequence[str | None], **more: Any
 ) -> list[dict[str, Any]]:

@@ -5,7 +5,18 @@ from typing import Any
 
 import fabricated
 import pytest
-from fabricated import DIA, ENVIRONMENT, GALLERY, PHOTOGRAPHS, SETTINGS, inapplicable, ldp, localizations, reconstructions
+from fabricated import (
+    DIA,
+    ENVIRONMENT,
+    GALLERY,
+    PHOTOGRAPHS,
+    SETTINGS,
+    baselines,
+    inapplicable,
+    ldp,
+    localizations,
+    reconstructions,
+)
 
 from bench.core.errors import UserError
 from leaderboard import comparison, group_tables
@@ -113,10 +124,11 @@ def test_a_defense_is_judged_by_the_strongest_attack(tmp_path: Path) -> None:
     affine = {"name": "affine", "dim": 4}
     (group,) = build(
         tmp_path,
-        reconstructions(NONE, [0.8, 0.8]),
-        reconstructions(affine, [0.2, 0.3]),
-        reconstructions(affine, [0.6, 0.7], attack=NEAREST),
-        reconstructions(ldp(8.0), [0.4, 0.5]),
+        reconstructions(NONE, [0.8, 0.8] * 3),
+        reconstructions(affine, [0.2, 0.3] * 3),
+        reconstructions(affine, [0.6, 0.7] * 3, attack=NEAREST),
+        reconstructions(ldp(8.0), [0.4, 0.5] * 3),
+        baselines(NONE, 6),
     )
     ranked = rank_defenses(group)
     assert [(one.rank, one.defense) for one in ranked] == [(1, "ldp:epsilon=8,subset_size=2"), (2, "affine:dim=4"), (3, "none")]
@@ -127,7 +139,8 @@ def test_a_defense_is_judged_by_the_strongest_attack(tmp_path: Path) -> None:
 
 
 def test_equal_scores_share_a_rank(tmp_path: Path) -> None:
-    (group,) = build(tmp_path, *(reconstructions(ldp(eps), [score]) for eps, score in ((1.0, 0.3), (2.0, 0.3), (3.0, 0.4))))
+    scores = ((1.0, 0.3), (2.0, 0.3), (3.0, 0.4))
+    (group,) = build(tmp_path, *(reconstructions(ldp(eps), [score] * 6) for eps, score in scores), baselines(ldp(1.0), 6))
     assert [one.rank for one in rank_defenses(group)] == [1, 1, 3]
 
 
@@ -136,9 +149,10 @@ def test_without_an_adapted_attacker_a_defense_is_unranked_and_last(tmp_path: Pa
     (group,) = build(
         tmp_path,
         [inapplicable(ldp(1.0), DIA, reason)],
-        reconstructions(ldp(1.0), [0.01, 0.01], attack=NEAREST),
-        reconstructions({"name": "other"}, [0.02, 0.02], attack=NEAREST),
-        reconstructions(NONE, [0.9, 0.9]),
+        reconstructions(ldp(1.0), [0.01] * 6, attack=NEAREST),
+        reconstructions({"name": "other"}, [0.02] * 6, attack=NEAREST),
+        reconstructions(NONE, [0.9] * 6),
+        baselines(NONE, 6),
     )
     assert [(one.rank, one.unranked_reason) for one in rank_defenses(group)] == [
         (1, None),
@@ -156,23 +170,24 @@ def test_an_incomplete_experiment_ranks_no_defense(tmp_path: Path, attack: dict[
     failed = fabricated.record("1.png", {}, defense=ldp(8.0), attack=attack, status="failed", reason="too dark")
     (group,) = build(
         tmp_path,
-        reconstructions(NONE, [0.5, 0.9]),
+        reconstructions(NONE, [0.5, 0.9] * 3),
         reconstructions(ldp(8.0), [0.1], attack=attack),
         [failed],
-        reconstructions(ldp(8.0), [0.2, 0.3], attack={"name": "dia", "weights": "sha256:other"}),
+        reconstructions(ldp(8.0), [0.2, 0.3] * 3, attack={"name": "dia", "weights": "sha256:other"}),
+        baselines(NONE, 6),
     )
     groups = by_defense(group)
     assert groups["none"].rank == 1
     standing = next(one for name, one in groups.items() if name.startswith("ldp"))
     assert standing.rank is None
-    assert "has completed 1 of 2 samples" in str(standing.unranked_reason)
+    assert "has completed 1 of 6 samples" in str(standing.unranked_reason)
     notes = [row.note for row in group_tables.build_pairs_table(group).rows]
     assert any("1 failed: 1.png: too dark" in note for note in notes)
 
 
 def test_a_photograph_that_fails_everywhere_is_ignored(tmp_path: Path) -> None:
     broken = [fabricated.record("bad.jpg", {}, defense=d, status="failed", reason="truncated") for d in (NONE, ldp(8.0))]
-    (group,) = build(tmp_path, reconstructions(NONE, [0.5]), reconstructions(ldp(8.0), [0.4]), broken)
+    (group,) = build(tmp_path, reconstructions(NONE, [0.5] * 6), reconstructions(ldp(8.0), [0.4] * 6), baselines(NONE, 6), broken)
     assert [one.rank for one in rank_defenses(group)] == [1, 2]
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import fabricated
 import pytest
-from fabricated import DIA, inapplicable, ldp, localizations, reconstructions
+from fabricated import DIA, baselines, inapplicable, ldp, localizations, reconstructions
 
 from bench.core import table as core_table
 from bench.core.table import to_csv, to_latex, to_markdown
@@ -24,9 +24,10 @@ HOSTILE = "<script>alert(1)</script> | *b* [x](javascript:y) $\\input{z}$ & 50% 
 @pytest.fixture
 def group(tmp_path: Path) -> ComparisonGroup:
     records = [
-        *reconstructions(NONE, [0.7, 0.9]),
-        *reconstructions(ldp(8.0), [0.3, 0.4]),
-        *reconstructions(ldp(8.0), [0.1, 0.2], attack=NEAREST),
+        *reconstructions(NONE, [0.7, 0.9] * 3),
+        *reconstructions(ldp(8.0), [0.3, 0.4] * 3),
+        *reconstructions(ldp(8.0), [0.1, 0.2] * 3, attack=NEAREST),
+        *baselines(NONE, 6),
         inapplicable(NONE, NEAREST, "nearest attacks Subspaces; none releases Descriptors"),
     ]
     (group,) = comparison.build_groups(comparison.load_records(fabricated.write(tmp_path, records)))
@@ -37,13 +38,13 @@ def cells(line: str, bar: str) -> list[str]:
     return [cell.strip() for cell in re.split(bar, line)]
 
 
-def test_numbers_have_bootstrap_intervals(group: ComparisonGroup) -> None:
+def test_numbers_have_students_intervals(group: ComparisonGroup) -> None:
     row = build_ranking_table(group).rows[0]
-    assert row.values["ssim"] == interval([0.3, 0.4])
+    assert row.values["ssim"] == interval([0.3, 0.4] * 3)
     assert row.values["epsilon_descriptor"] == 8.0
-    assert row.values["epsilon_image"] == pytest.approx(8.0 * 100.5 * 0.9)  # the smaller composition, the median photograph
+    assert row.values["epsilon_image"] == pytest.approx(8.0 * 102.5 * 0.9)  # the smaller composition, the median photograph
     assert row.values["guarantee"] == "ε-LDP"
-    assert "| **0.35 [0.3, 0.4]** |" in to_markdown(build_ranking_table(group))
+    assert "| **0.35 [0.2925, 0.4075]** |" in to_markdown(build_ranking_table(group))
 
 
 def test_the_best_is_bold_among_the_strongest_attacks_alone(group: ComparisonGroup) -> None:
@@ -53,7 +54,7 @@ def test_the_best_is_bold_among_the_strongest_attacks_alone(group: ComparisonGro
     index = table.columns.index(ssim)
     bold = [(row.values["defense"], row.values["attack"]) for row in table.rows if index in row.best]
     assert bold == [("ldp:epsilon=8,subset_size=2", "dia")]
-    assert r"\textbf{0.35 {[}0.3, 0.4{]}}" in to_latex(table)
+    assert r"\textbf{0.35 {[}0.2925, 0.4075{]}}" in to_latex(table)
 
 
 def test_rows_that_do_not_apply_state_the_reason(group: ComparisonGroup) -> None:
@@ -70,7 +71,7 @@ def test_rows_that_do_not_apply_state_the_reason(group: ComparisonGroup) -> None
 
 def test_csv_has_full_precision_and_the_ends_of_intervals(group: ComparisonGroup) -> None:
     first, *_ = csv.DictReader(io.StringIO(to_csv(build_ranking_table(group))))
-    expected = interval([0.3, 0.4])
+    expected = interval([0.3, 0.4] * 3)
     assert [float(first[name]) for name in ("ssim", "ssim_low", "ssim_high")] == [expected.mean, expected.low, expected.high]
     assert first["rank"] == "1"
     (inapplicable,) = (row for row in csv.DictReader(io.StringIO(to_csv(build_pairs_table(group)))) if row["units"] == "n/a")
@@ -94,7 +95,7 @@ def test_a_metric_of_some_photographs_shows_their_number(tmp_path: Path) -> None
     table = build_pairs_table(group)
     (row,) = table.rows
     (column,) = (column for column in table.columns if column.name == "face")
-    assert row.texts[table.columns.index(column)] == "0.5 [0, 1] (n = 2)"
+    assert row.texts[table.columns.index(column)] == "0.5 [0.09453, 0.9055] (n = 2)"
 
 
 def test_latex_is_booktabs_of_even_rows(group: ComparisonGroup) -> None:
@@ -104,7 +105,7 @@ def test_latex_is_booktabs_of_even_rows(group: ComparisonGroup) -> None:
     assert layout
     rows = [line for line in written.splitlines() if line.endswith(r" \\")]
     assert {len(re.findall(r"(?<!\\)&", row)) + 1 for row in rows} == {len(layout[1])}
-    assert len(rows) == 5
+    assert len(rows) == 7
     assert r"$\varepsilon$-LDP" in written
 
 

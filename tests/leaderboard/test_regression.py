@@ -197,7 +197,7 @@ def test_false_alarms_are_rare_and_shifts_are_found(rng: np.random.Generator) ->
     assert sum(apart(3.0) for _ in range(200)) >= 198
 
 
-def test_tolerance_with_one_seed_is_the_bootstrap_and_with_one_sample_the_minimum() -> None:
+def test_tolerance_with_one_seed_is_students_and_with_one_sample_the_minimum() -> None:
     before = {str(sample): [0.0] for sample in range(7)}
     steady = {str(sample): [0.1 + sample / 1000] for sample in range(7)}
     mixed = {str(sample): [0.3 * (-1) ** sample] for sample in range(7)}

@@ -8,6 +8,7 @@ from io import StringIO
 from pathlib import Path
 from typing import Any
 
+import fabricated
 import numpy as np
 import pandas as pd
 import pytest
@@ -22,11 +23,12 @@ from bench.core import progress
 from bench.core.table import Table as PrintedTable
 from bench.core.table import write_csv
 from bench.extractors.sift import Sift
-from bench.registry import discovery
+from bench.registry import discovery, spec
+from bench.runner import suite
 from bench.runner.records import FILE, Record
 from bench.settings import Asset
 from bench.tasks.reconstruction import Reconstruction
-from leaderboard.reproduce import command, figures, page, run, tables
+from leaderboard.reproduce import command, figures, page, run, study, tables
 from leaderboard.reproduce.claims import Claim, Verdict, falling, same_order
 from leaderboard.reproduce.profiles import CPU, SMOKE, Materials, Setting
 from leaderboard.reproduce.run import EvaluationSet, RunResult
@@ -119,7 +121,7 @@ def test_repeated_reproduction_runs_nothing_and_changes_nothing(images: Path, ou
         {key for row in json.loads((out / f"{name}.json").read_text())["rows"] for key in row["cell_ids"]}
         for name in ("table1", "table4")
     )
-    assert len(first & fourth) == 12
+    assert len(first & fourth) == 14
 
 
 def find_unsupported_rows(setting: Setting) -> dict[str, str | None]:
@@ -224,24 +226,25 @@ TABLE = Table(
 )
 
 
+def build_record(sample: str, metrics: dict[str, Any], **more: Any) -> Record:
+    fields = {"sample": sample, "seed": 0, "status": "ok", "reason": None, "attack": None, "metrics": metrics, "notes": []}
+    return fields | more
+
+
 def reproduce_table(ssim: dict[str, list[float | None]]) -> run.ReproducedTable:
-    """Return a table from records with half the given values; None: a failed photograph, no values: n/a."""
+    """Return a table from records with half the given values; None: a failed photograph, no values: n/a.
+
+    The records have no attack, so no signal is judged.
+    """
     setting = Setting(profile=CPU, materials=Materials(), extractor=Sift(), photographs=8)
     records: dict[str, tuple[Record, ...]] = {
         name: tuple(
-            {"sample": str(number), "seed": 0, "status": "failed", "reason": "broken", "metrics": {}, "notes": []}
+            build_record(str(number), {}, status="failed", reason="broken")
             if value is None
-            else {
-                "sample": str(number),
-                "seed": 0,
-                "status": "ok",
-                "reason": None,
-                "metrics": {"ssim": value / 2},
-                "notes": ["small"],
-            }
+            else build_record(str(number), {"ssim": value / 2}, notes=["small"])
             for number, value in enumerate(values)
         )
-        or ({"sample": "*", "seed": 0, "status": "n/a", "reason": "no network", "metrics": {}, "notes": []},)
+        or (build_record("*", {}, status="n/a", reason="no network"),)
         for name, values in ssim.items()
     }
     result = RunResult(rows=build_rows(setting), experiment_ids={name: (name,) for name in ssim}, records=records)
@@ -300,8 +303,7 @@ def test_median_counts_a_sample_without_a_value_as_the_worst() -> None:
     setting = Setting(profile=CPU, materials=Materials(), extractor=Sift(), photographs=1)
     values = {0: 1.0, 1: None, 2: 2.0, 3: None, 4: None}
     records: dict[str, tuple[Record, ...]] = {
-        f"seed {seed}": ({"sample": "a", "seed": seed, "status": "ok", "reason": None, "metrics": {"off": off}, "notes": []},)
-        for seed, off in values.items()
+        f"seed {seed}": (build_record("a", {"off": off}, seed=seed),) for seed, off in values.items()
     }
     row = build_rows(setting)[0]
     result = RunResult(rows=(row,), experiment_ids={row.name: tuple(records)}, records=records)
@@ -314,6 +316,70 @@ def test_median_counts_a_sample_without_a_value_as_the_worst() -> None:
     assert values["n"] == "2/5"
     assert "seeds 0 to 5" in page.format_heading(table)
     assert json.loads(json.dumps(page.to_json(table), allow_nan=False))["rows"][0]["ours"]["median"]["ours"] == "inf"
+
+
+SIGNAL_ROWS = {"raw": build_values(0.6), "two": build_values(0.4), "four": build_values(0.11)}
+
+
+def reproduce_signals(baselines: dict[str, list[float | None]]) -> run.ReproducedTable:
+    """Return a table of these rows and baselines."""
+    setting = Setting(profile=CPU, materials=Materials(), extractor=Sift(), photographs=8)
+    rows = (*build_rows(setting)[:3], *study.build_baseline_rows(Reconstruction()))
+    records = {
+        row.name: tuple(
+            fabricated.record(str(number), {"ssim": value}, defense={"name": "none"}, attack=spec.to_json(row.attack))
+            for number, value in enumerate((SIGNAL_ROWS | baselines).get(row.name, ()))
+        )
+        for row in rows
+        if row.attack is not None
+    }
+    result = RunResult(rows=rows, experiment_ids={row.name: (row.name,) for row in rows}, records=records)
+    return run.compare_with_paper(TABLE, setting, EvaluationSet(name="photographs", names=("0",) * 8, available=8), result)
+
+
+def test_a_claim_about_a_row_without_a_signal_cannot_be_decided() -> None:
+    table = reproduce_signals({"blank": build_values(0.1), "keypoints": build_values(0.2)})
+    assert {name: signal.word for name, signal in table.signals.items()} == {
+        "raw": "yes",
+        "two": "yes",
+        "four": "no",
+        "blank": "baseline",
+        "keypoints": "baseline",
+    }
+    order, falls = table.claim_results
+    assert falls.verdict is order.verdict is Verdict.OPEN
+    assert falls.evidence[0].reason == "four: no signal: attack at baseline"
+    assert {evidence.statement.text: evidence.verdict for evidence in order.evidence}["[raw] ssim > [two] ssim"] is Verdict.HOLDS
+    markdown = page.to_markdown(table)
+    assert "(four: no signal: attack at baseline)" in markdown
+    shown = {row["row"] if row.get("row") else row["attack"]: row["signal"] for row in list_texts(page.compare_values(table))}
+    assert shown == {"raw": "yes", "two": "yes", "four": "no", "blank": "baseline", "keypoints": "baseline"}
+    report = page.to_json(table)
+    assert [row["signal"] for row in report["rows"]][2] == "no signal: attack at baseline"
+    entries = pd.read_csv(StringIO(write_csv(page.tabulate_values(table)))).set_index(["row", "measure"])
+    assert entries.loc[("four", "ssim"), "signal"] == "no signal: attack at baseline"
+
+
+def test_without_baselines_no_claim_is_decided() -> None:
+    table = reproduce_signals({"blank": build_values(0.1)})
+    assert {result.verdict for result in table.claim_results} == {Verdict.OPEN}
+    assert "Add --attack keypoints." in page.to_markdown(table)
+    control = reproduce_signals({"blank": build_values(0.05), "keypoints": build_values(0.06)})
+    assert control.claim_results[1].verdict is Verdict.HOLDS
+
+
+def test_tables_and_suites_of_reconstructions_have_both_baselines() -> None:
+    for name in ("table1", "table4"):
+        table = tables.load_tables()[name]
+        setting = Setting(profile=CPU, materials=Materials(), extractor=Sift(), photographs=7)
+        references = table.build_reference_rows(setting)
+        assert {"blank", "keypoints"} <= {row.name for row in references}
+        assert all(row.paper or row.name in ("blank", "keypoints") for row in references)
+    attacks = {
+        name: {spec.to_json(attack)["name"] for part in suite.find(name).parts for _, attack in part.pairs if attack is not None}
+        for name in suite.list_suites()
+    }
+    assert [name for name, names in attacks.items() if names and not {"blank", "keypoints"} <= names] == []
 
 
 def test_the_order_of_the_paper_is_confirmed() -> None:

@@ -13,6 +13,7 @@ from fabricated import (
     ENVIRONMENT,
     PHOTOGRAPHS,
     SETTINGS,
+    baselines,
     draw_picture,
     inapplicable,
     ldp,
@@ -41,13 +42,14 @@ def results(folder: Path) -> Path:
     hostile = {"name": HOSTILE, HOSTILE: HOSTILE}
     strange = PHOTOGRAPHS | {"name": f"zoo {HOSTILE}", "hash": "sha256:" + "f" * 64}
     reconstructed = [
-        *reconstructions(NONE, [0.8, 0.7, 0.9]),
-        *reconstructions(AFFINE, [0.4, 0.5, 0.3]),
-        *reconstructions(AFFINE, [0.6, 0.5, 0.7], attack=NEAREST),
-        *reconstructions(ldp(16.0), [0.5, 0.4, 0.6]),
-        *reconstructions(ldp(4.0), [0.2, 0.1, 0.3]),
-        *reconstructions({"name": "new"}, [0.01, 0.01, 0.01], attack=NEAREST),
-        *reconstructions(hostile, [0.95, 0.95, 0.95], reason=None, notes=[HOSTILE]),
+        *reconstructions(NONE, [0.8, 0.7, 0.9] * 2),
+        *reconstructions(AFFINE, [0.4, 0.5, 0.3] * 2),
+        *reconstructions(AFFINE, [0.6, 0.5, 0.7] * 2, attack=NEAREST),
+        *reconstructions(ldp(16.0), [0.5, 0.4, 0.6] * 2),
+        *reconstructions(ldp(4.0), [0.2, 0.1, 0.3] * 2),
+        *reconstructions({"name": "new"}, [0.01, 0.01, 0.01] * 2, attack=NEAREST),
+        *reconstructions(hostile, [0.95, 0.95, 0.95] * 2, reason=None, notes=[HOSTILE]),
+        *baselines(NONE, 6),
         *reconstructions(NONE, [0.5], dataset=strange),
     ]
     others = [
@@ -177,7 +179,7 @@ def test_filtering_by_words_and_showing_all_attacks(page: Any) -> None:
     box = page.locator(".group:visible .filter")
     box.fill("LDP epsilon=16")
     assert listed(page) == [LDP16]
-    assert page.locator(".group:visible .count").inner_text() == "1 of 9 rows"
+    assert page.locator(".group:visible .count").inner_text() == "1 of 11 rows"
     box.fill("nearest affine")
     assert listed(page, "attack") == ["nearest"]
     page.locator(".group:visible .only").uncheck()
@@ -186,7 +188,7 @@ def test_filtering_by_words_and_showing_all_attacks(page: Any) -> None:
     box.fill("no such thing")
     assert listed(page) == []
     box.fill("")
-    assert len(listed(page)) == 9
+    assert len(listed(page)) == 11
 
 
 @pytest.mark.exhaustive
@@ -198,7 +200,7 @@ def test_a_row_opens_its_experiment_by_click_and_the_way_back_closes_it(page: An
     text = shown.inner_text()
     assert "ε of a descriptor" in text
     assert "ε of an image, basic composition" in text
-    assert "404 (400 to 408)" in text  # 4 for each of 101 (100 to 102) keypoints
+    assert "410 (400 to 420)" in text  # 4 for each of 102.5 (100 to 105) keypoints
     assert "Not covered by ε: the keypoints' positions, the number of keypoints." in text
     shown.locator("summary").click()
     assert ENVIRONMENT["source"] in shown.inner_text()
@@ -484,18 +486,18 @@ def test_the_sample_above_the_table_is_the_first_that_most_ranked_defenses_have(
         assert overview is not None
         return overview.sample
 
-    none, affine, ranked = (reconstructions(one, [0.8, 0.7, 0.6, 0.5]) for one in (NONE, AFFINE, ldp(4.0)))
+    none, affine, ranked = (reconstructions(one, [0.8, 0.7, 0.6, 0.5, 0.6, 0.7]) for one in (NONE, AFFINE, ldp(4.0)))
     unranked = [
-        *reconstructions({"name": "new"}, [0.8] * 4, attack=NEAREST),
-        *reconstructions({"name": "newer"}, [0.8] * 4, attack=NEAREST),
+        *reconstructions({"name": "new"}, [0.8] * 6, attack=NEAREST),
+        *reconstructions({"name": "newer"}, [0.8] * 6, attack=NEAREST),
     ]
-    records = [*none, *affine, *ranked, *unranked]
-    pictured = [*none, *affine[1:], *ranked[1:], unranked[0], unranked[4]]
+    records = [*none, *affine, *ranked, *unranked, *baselines(NONE, 6)]
+    pictured = [*none, *affine[1:], *ranked[1:], unranked[0], unranked[6]]
     assert choose("one", records, pictured) == "1.png"  # three ranked defenses; 0.png has one, and two unranked ones
     pictured.remove(affine[1])
     assert choose("two", records, pictured) == "2.png"
     assert choose("three", records[::-1], pictured) == "2.png"  # workers write records as they finish
-    assert choose("four", unranked, [unranked[1], unranked[2], unranked[6]]) == "2.png"  # without ranks, all rows count
+    assert choose("four", unranked, [unranked[1], unranked[2], unranked[8]]) == "2.png"  # without ranks, all rows count
 
 
 @pytest.mark.slow

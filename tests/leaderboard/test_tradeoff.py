@@ -6,7 +6,18 @@ from typing import Any
 import fabricated
 import numpy as np
 import pytest
-from fabricated import DIA, ENVIRONMENT, GALLERY, PHOTOGRAPHS, inapplicable, ldp, localizations, reconstructions, record
+from fabricated import (
+    DIA,
+    ENVIRONMENT,
+    GALLERY,
+    PHOTOGRAPHS,
+    baselines,
+    inapplicable,
+    ldp,
+    localizations,
+    reconstructions,
+    record,
+)
 
 from leaderboard import comparison, plots
 from leaderboard.comparison import ComparisonGroup
@@ -43,10 +54,11 @@ def test_the_front_has_no_dominated_points(seed: int) -> None:
 def test_points_join_the_two_groups_under_each_condition(tmp_path: Path) -> None:
     day, night = build(
         tmp_path,
-        reconstructions(NONE, [0.8, 0.8]),
-        reconstructions(ldp(8.0), [0.3, 0.3]),
-        reconstructions(ldp(8.0), [0.5, 0.5], attack={"name": "nearest"}),
-        reconstructions(ldp(1.0), [0.2, 0.2]),  # has no recall
+        reconstructions(NONE, [0.8] * 8),
+        reconstructions(ldp(8.0), [0.3] * 8),
+        reconstructions(ldp(8.0), [0.5] * 8, attack={"name": "nearest"}),
+        reconstructions(ldp(1.0), [0.2] * 8),  # has no recall
+        baselines(NONE, 8, 0.1),
         localizations(NONE, [1, 1, 1, 0], DAYS),
         localizations(ldp(8.0), [1, 0, 0, 0], DAYS),
     )
@@ -58,6 +70,7 @@ def test_points_join_the_two_groups_under_each_condition(tmp_path: Path) -> None
     assert {p.utility.mean for p in night.points} == {0.5, 0.0}
     assert day.caption == "Day: SSIM on photos, recall (0.25 m, 2°) on gallery"
     assert all(point.on_front for point in day.points)
+    assert day.baselines == {"blank": pytest.approx(0.1), "keypoints": pytest.approx(0.1)}
 
 
 def test_the_same_photographs_come_before_others(tmp_path: Path) -> None:
@@ -121,8 +134,9 @@ def test_an_unranked_defense_is_shown_but_not_on_the_front(tmp_path: Path) -> No
     (one,) = build(
         tmp_path,
         [inapplicable(ldp(1.0), DIA, "no adapted attacker")],
-        reconstructions(ldp(1.0), [0.01, 0.01], attack={"name": "nearest"}),
-        reconstructions(NONE, [0.8, 0.8]),
+        reconstructions(ldp(1.0), [0.01] * 6, attack={"name": "nearest"}),
+        reconstructions(NONE, [0.8] * 6),
+        baselines(NONE, 6),
         localizations(ldp(1.0), [1, 1], [None, None]),
         localizations(NONE, [1, 0], [None, None]),
     )
@@ -175,9 +189,12 @@ def test_labels_are_nearest_to_their_own_points() -> None:
 @pytest.mark.slow
 def test_plots_are_drawn_of_the_available_records(tmp_path: Path) -> None:
     records = [
-        *reconstructions(NONE, [0.8, 0.7]),
-        *reconstructions(ldp(8.0), [0.5, 0.4]),
-        *reconstructions(ldp(2.0), [0.3, 0.2]),
+        *reconstructions(NONE, [0.8, 0.7] * 3),
+        *reconstructions(ldp(8.0), [0.5, 0.4] * 3),
+        *reconstructions(ldp(2.0), [0.3, 0.2] * 3),
+        *reconstructions(ldp(1.0), [0.1, 0.1] * 3),
+        *baselines(NONE, 6, 0.1),
+        *localizations(ldp(1.0), [0, 0], [None, None]),
         *localizations(NONE, [1, 1], [None, None]),
         *localizations(ldp(8.0), [1, 0], [None, None]),
     ]
@@ -185,10 +202,29 @@ def test_plots_are_drawn_of_the_available_records(tmp_path: Path) -> None:
     figures = dict(plots.draw_plots(groups[0], build_tradeoffs(groups[0], groups)))
     assert list(figures) == ["attacks", "epsilon", "tradeoff"]
     (axes,) = figures["tradeoff"].axes
-    assert {text.get_text() for text in axes.texts} == {"none", "ldp"}
+    assert {text.get_text() for text in axes.texts} == {"none", "ldp ε 8", "ldp ε 1"}
+    for plot, axis in (("tradeoff", 1), ("epsilon", 1), ("attacks", 0)):
+        (drawn,) = figures[plot].axes
+        lines = {str(line.get_label()): line for line in drawn.lines}
+        for name in ("blank", "keypoints"):
+            data = (lines[f"baseline {name}"].get_xdata(), lines[f"baseline {name}"].get_ydata())[axis]
+            np.testing.assert_allclose(data, 0.1)
+    labels = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert "ldp, no signal" in labels
+    markers = {str(drawn.get_label()): drawn.lines[0] for drawn in axes.containers}
+    assert markers["ldp, no signal"].get_markerfacecolor() == "white"
+    assert markers["ldp"].get_markerfacecolor() != "white"
+    (curve,) = figures["epsilon"].axes
+    (hollow,) = (line for line in curve.lines if line.get_markerfacecolor() == "white" and len(line.get_xdata()))
+    np.testing.assert_allclose(hollow.get_xydata(), [[1.0, 0.1]])
     front = next(line for line in axes.lines if line.get_label() == "Pareto front")
     np.testing.assert_allclose(front.get_xydata(), [[0.5, 0.45], [1.0, 0.75]])
-    assert [tick.get_text()[:8] for tick in figures["attacks"].axes[0].get_yticklabels()] == ["1  ldp:e", "2  ldp:e", "3  none"]
+    assert [tick.get_text()[:8] for tick in figures["attacks"].axes[0].get_yticklabels()] == [
+        "1  ldp:e",
+        "2  ldp:e",
+        "3  none",
+        "unranked",
+    ]
 
 
 def test_points_of_the_pages_plot_are_at_their_values(tmp_path: Path) -> None:

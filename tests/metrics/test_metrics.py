@@ -10,9 +10,9 @@ from skimage import metrics as reference
 
 from bench.api import Metric
 from bench.images import photographs
-from metrics import angle, face, l2, mae, mse, psnr, recovered, ssim
+from metrics import angle, face, identified, l2, mae, mse, psnr, recovered, ssim
 
-IMAGES = [face.PLUGIN, mae.PLUGIN, mse.PLUGIN, psnr.PLUGIN, ssim.PLUGIN]
+IMAGES = [face.PLUGIN, identified.PLUGIN, mae.PLUGIN, mse.PLUGIN, psnr.PLUGIN, ssim.PLUGIN]
 DESCRIPTORS = [angle.PLUGIN, l2.PLUGIN, recovered.PLUGIN]
 
 

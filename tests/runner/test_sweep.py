@@ -115,7 +115,7 @@ def test_every_shipped_suite_can_be_planned() -> None:
     assert {"smoke", "paper-table-1", "paper-table-4", "attacks", "full"} <= suites.keys()
     assert all(each.parts and each.summary for each in suites.values())
     assert len(suites["full"].parts) == sum(len(each.parts) for name, each in suites.items() if name != "full")
-    assert len(build_plan(suites["smoke"].parts[0])) == 9
+    assert len(build_plan(suites["smoke"].parts[0])) == 12
 
 
 @pytest.mark.slow

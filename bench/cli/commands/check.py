@@ -9,7 +9,7 @@ from bench.cli.terminal import DONE, FAILED, REGRESSION, print_rich
 
 SUMMARY = "compare results with a baseline, experiment by experiment: better, worse, or unchanged"
 EPILOG = """Experiments are matched by configuration and inputs; seeds may differ. The tolerance comes from the spread between
-seeds, or with one seed from the bootstrap over samples; see docs/formats.md.
+seeds, or with one seed from Student's interval over samples; see docs/formats.md.
 
 exit status: 0 nothing is worse; 1 a part of the baseline is missing; 2 invalid arguments;
 3 privacy or utility is worse than tolerated, or an attack is weaker

@@ -7,10 +7,11 @@ from collections.abc import Mapping
 
 from bench.api import Defense
 from bench.registry import discovery
+from leaderboard.chance import IDENTIFIED, label_identified
 from leaderboard.reproduce import published
 from leaderboard.reproduce.claims import Claim, Statement, TableEntry, at_least, falling, same_order
 from leaderboard.reproduce.profiles import Setting
-from leaderboard.reproduce.study import Measure, Row, Table, build_plugin, build_reconstruction
+from leaderboard.reproduce.study import Measure, Row, Table, build_baseline_rows, build_plugin, build_reconstruction
 
 PRINTED = ("mae", "ssim", "psnr")
 DIMS = (2, 4, 8, 16)
@@ -44,6 +45,10 @@ def build_rows(setting: Setting) -> tuple[Row, ...]:
         for line in lines[:-1]
     ]
     return (undefended, *lifted)
+
+
+def build_reference_rows(setting: Setting) -> tuple[Row, ...]:
+    return build_baseline_rows(build_reconstruction(setting))
 
 
 def build_lifting(dim: int, setting: Setting) -> Defense:
@@ -107,10 +112,12 @@ TABLE = Table(
         "mae": Measure(metric="mae", digits=4),
         "ssim": Measure(metric="ssim", digits=4),
         "psnr": Measure(metric="psnr", digits=2),
+        label_identified(): Measure(metric=IDENTIFIED, digits=3),
         "recovered": Measure(metric="recovered", factor=100, digits=1),
         "angle": Measure(metric="angle", digits=1),
     },
     build_rows=build_rows,
     build_claims=build_claims,
     rank_measure="ssim",
+    build_reference_rows=build_reference_rows,
 )

@@ -8,10 +8,11 @@ from collections.abc import Mapping
 from bench.codebook.public import Public
 from bench.core.errors import UserError
 from bench.registry import discovery
+from leaderboard.chance import IDENTIFIED, label_identified
 from leaderboard.reproduce import published, scale
 from leaderboard.reproduce.claims import Claim, TableEntry, about_equal, falling, greater, same_order
 from leaderboard.reproduce.profiles import Setting
-from leaderboard.reproduce.study import Measure, Row, Table, build_plugin, build_reconstruction
+from leaderboard.reproduce.study import Measure, Row, Table, build_baseline_rows, build_plugin, build_reconstruction
 from leaderboard.reproduce.tables import table1
 
 PRINTED = ("mae", "ssim", "psnr")
@@ -57,7 +58,8 @@ def _check_size(setting: Setting) -> None:
 
 
 def build_reference_rows(setting: Setting) -> tuple[Row, ...]:
-    return tuple(row for row in table1.build_rows(setting) if row.labels["attack"] in COMPARED)
+    compared = tuple(row for row in table1.build_rows(setting) if row.labels["attack"] in COMPARED)
+    return (*build_baseline_rows(build_reconstruction(setting)), *compared)
 
 
 def format_name(size: int, epsilon: int, subset: int) -> str:
@@ -118,6 +120,7 @@ TABLE = Table(
         "mae": Measure(metric="mae", digits=4),
         "ssim": Measure(metric="ssim", digits=4),
         "psnr": Measure(metric="psnr", digits=2),
+        label_identified(): Measure(metric=IDENTIFIED, digits=3),
     },
     build_rows=build_rows,
     build_claims=build_claims,

@@ -1,0 +1,1 @@
+"""Identification of a photograph from its reconstruction."""

@@ -1,0 +1,69 @@
+"""Thumbnails: 16 x 16 blurred luminance of an image, their similarity, and the rank of the right one among others.
+
+A thumbnail shows the layout of a photograph and none of its details. So it can tell whether a reconstruction shows the right
+photograph where SSIM and PSNR are those of a blank image.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.types import Floats
+
+Doubles = NDArray[np.float64]
+
+SIDE = 16  # pixels of a thumbnail
+SIGMA = 3.0  # pixels of an image of 256 x 256
+LUMINANCE = (0.299, 0.587, 0.114)  # Rec. 601, as in OpenCV
+CONSTANT = 1e-5  # standard deviation of luminance; an image of 8 bits that is not constant has more
+
+
+def compute_thumbnail(image: Floats | Doubles) -> Doubles:
+    """Return the blurred luminance of an image, averaged over a grid. (H, W, 3) in [0, 1] -> (16, 16) in [0, 1]
+
+    The standard deviation of the Gaussian is 3 pixels for each 256 pixels of a side. A pixel that crosses the edge of a grid cell
+    counts in each by its area.
+    """
+    from scipy.ndimage import gaussian_filter
+
+    luminance = image.astype(np.float64) @ np.array(LUMINANCE)
+    height, width = luminance.shape
+    blurred = gaussian_filter(luminance, (SIGMA * height / 256, SIGMA * width / 256))
+    return _average_weights(height) @ blurred @ _average_weights(width).T
+
+
+def _average_weights(length: int) -> Doubles:
+    """Return the weights of an average over 16 intervals of equal length. -> (16, length), rows have sum 1"""
+    edges = np.linspace(0, length, SIDE + 1)
+    pixels = np.arange(length)
+    overlaps = np.minimum(edges[1:, None], pixels + 1) - np.maximum(edges[:-1, None], pixels)  # (16, length)
+    return np.clip(overlaps, 0, None) * (SIDE / length)
+
+
+def normalize_thumbnails(thumbnails: Doubles) -> Doubles:
+    """Subtract the mean of each thumbnail and scale it to unit norm; a constant one becomes zero. (..., 16, 16) -> (..., 256)"""
+    rows = thumbnails.reshape(*thumbnails.shape[:-2], SIDE * SIDE)
+    centred = rows - rows.mean(axis=-1, keepdims=True)
+    norms = np.linalg.norm(centred, axis=-1, keepdims=True)
+    smallest = CONSTANT * SIDE  # the norm is the standard deviation times the root of 16 x 16
+    return np.where(norms > smallest, centred / np.maximum(norms, smallest), 0.0)
+
+
+def compare_thumbnails(one: Doubles, other: Doubles) -> Doubles:
+    """Return the normalised correlation of thumbnails, from -1 to 1. (..., 16, 16), (..., 16, 16) -> (...)
+
+    It does not change with brightness and contrast. A constant thumbnail has similarity 0 with every other.
+    """
+    return np.asarray((normalize_thumbnails(one) * normalize_thumbnails(other)).sum(axis=-1))
+
+
+def rank_first(similarities: Doubles) -> float:
+    """Return the rank of the first among all, from 1 for the greatest; equal values have their mean rank. (N,) -> 1 to N
+
+    >>> rank_first(np.array([0.4, 0.9, 0.1]))
+    2.0
+    >>> rank_first(np.zeros(256))
+    128.5
+    """
+    return float(1 + (similarities[1:] > similarities[0]).sum() + (similarities[1:] == similarities[0]).sum() / 2)
