@@ -122,7 +122,7 @@ def _build_table(records: list[Record], brief: bool, foldable: bool) -> Table:
             )
             for row in rows
         ),
-        remarks=(*failures, *chance, *remarks) if brief else (*_explain_metrics(metrics), *chance, *remarks, *failures),
+        remarks=(*failures, *chance, *remarks) if brief else (*_explain_metrics(metrics), *remarks, *failures),
         note_column=1,  # the attack
     )
 

@@ -10,7 +10,7 @@ from bench import cli
 
 ROOT = Path(__file__).resolve().parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-TOLERANCE = {"MAE": 0.002, "SSIM": 0.005, "PSNR": 0.1}  # between machines: float32 or bf16
+TOLERANCE = {"SSIM": 0.005, "PSNR": 0.1, "identified (chance 0.024)": 0.05}  # between machines: float32 or bf16
 
 Row = dict[str, str]
 
@@ -24,12 +24,14 @@ def read_table(text: str) -> list[Row]:
 
 def list_differences(printed: list[Row], reported: list[Row]) -> list[str]:
     """Return the entries of the README that are not those of the report."""
-    differences = ["another number of rows"] if len(printed) != len(reported) else []
-    for row, other in zip(printed, reported, strict=False):
+    differences = []
+    rows = {(row["defense"], row["attack"]): row for row in reported}
+    for row in printed:
+        other = rows.get((row["defense"], row["attack"]), {})
         for column, text in row.items():
-            tolerance = TOLERANCE.get(column)
-            same = text == other[column] if tolerance is None else abs(float(text) - float(other[column])) <= tolerance
-            differences += [] if same else [f"{row['defense']}, {row['attack']}: {column} {text}, reported {other[column]}"]
+            expected, tolerance = other.get(column, "nothing"), TOLERANCE.get(column)
+            same = text == expected if tolerance is None or not other else abs(float(text) - float(expected)) <= tolerance
+            differences += [] if same else [f"{row['defense']}, {row['attack']}: {column} {text}, reported {expected}"]
     return differences
 
 
@@ -45,14 +47,13 @@ def test_results_are_those_of_the_demo(tmp_path: Path) -> None:
     reported = read_table((tmp_path / "run" / "report.md").read_text(encoding="utf-8"))
     printed = read_table(README[README.index("## Results") :])
     assert list_differences(printed, reported) == []
-    assert len(printed) == 8
+    assert len(printed) == 6
 
 
 def test_other_results_are_found() -> None:
     printed = read_table(README[README.index("## Results") :])
     assert list_differences(printed, printed) == []
-    assert list_differences(printed, [printed[0] | {"SSIM": "0.6"}, *printed[1:]]) == ["none, dia: SSIM 0.6771, reported 0.6"]
-    assert list_differences(printed, [printed[0] | {"attack": "nearest"}, *printed[1:]]) == [
-        "none, dia: attack dia, reported nearest"
-    ]
-    assert list_differences(printed, printed[1:])[0] == "another number of rows"
+    for column, text in {"SSIM": "0.6", "note": "no signal"}.items():
+        (difference,) = list_differences([printed[0] | {column: text}], printed)
+        assert difference == f"none, dia: {column} {text}, reported {printed[0][column]}"
+    assert len(list_differences(printed[:1], printed[1:])) == len(printed[0])
