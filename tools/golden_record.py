@@ -181,7 +181,7 @@ def find_differences(before: Sequence[dict[str, Any]], after: Iterable[dict[str,
         old = known.get(label(new), {})
         for name in sorted(old.keys() | new.keys()):
             value = new.get(name)
-            if name == "metrics" and name in old:
+            if name == "metrics" and value and old.get(name):
                 value = {metric: value[metric] for metric in value if metric in old[name]}
             if not close(old.get(name), value):
                 yield f"{label(new)}: {name} was {old.get(name)}, is {value}"
