@@ -1,12 +1,17 @@
-"""The table of results in the README is the one that `make demo` prints, and the README is short."""
+"""The README is short, its table is the one that `make demo` prints, and its defense releases what the text says."""
 
 import re
 import shlex
 from pathlib import Path
 
+import numpy as np
 import pytest
+from sessions import list_blocks
 
 from bench import cli
+from bench.codebook import examples
+from bench.codebook.public import Public
+from bench.registry import discovery
 
 ROOT = Path(__file__).resolve().parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -57,3 +62,15 @@ def test_other_results_are_found() -> None:
         (difference,) = list_differences([printed[0] | {column: text}], printed)
         assert difference == f"none, dia: {column} {text}, reported {printed[0][column]}"
     assert len(list_differences(printed[:1], printed[1:])) == len(printed[0])
+
+
+def test_the_defense_of_the_readme_rounds_components(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    code = next(block.text for block in list_blocks(README) if "class Rounding" in block.text)
+    (tmp_path / "rounding.py").write_text(code)
+    monkeypatch.syspath_prepend(tmp_path)
+    import rounding
+
+    plugin = discovery.check(discovery.DEFENSE, rounding.PLUGIN)
+    secret = examples.draw_features(20, 0)
+    release = plugin(levels=4).protect(secret, Public(), np.random.default_rng(0))
+    assert set(np.unique(release.descriptors * 4)) <= {0, 1, 2, 3, 4}
