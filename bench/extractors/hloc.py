@@ -38,7 +38,10 @@ class Hloc(Extractor):
 
     def extract(self, image: np.ndarray, source: Path | None = None) -> Features:
         if source is None:
-            raise UserError("hloc: features are found by the photograph's file, but this image has none")
+            raise UserError(
+                "hloc: features are found by the photograph's file, but this image has none. Training and dictionaries use "
+                "mirrored views: choose an extractor that computes features"
+            )
         keypoints, stored, size = self._read(source)
         _check(source, stored, len(keypoints), self.dimension, size)
         descriptors = stored.T  # (N, D)

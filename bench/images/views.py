@@ -46,8 +46,9 @@ def extract_views(source: Source, extractor: Extractor) -> Iterator[PhotographVi
 
 
 def _extract_view(pixels: Bytes, mirrored: bool, photograph: str, source: Source, extractor: Extractor) -> PhotographView:
-    if mirrored:
-        pixels = np.ascontiguousarray(pixels[:, ::-1])
+    if mirrored:  # features that are stored with the file are those of the unmirrored photograph
+        mirror = np.ascontiguousarray(pixels[:, ::-1])
+        return PhotographView(photograph, mirror, extractor.extract(mirror, None))
     return PhotographView(photograph, pixels, extractor.extract(pixels, source.path))
 
 

@@ -16,6 +16,7 @@ from bench.core.errors import SampleError, UserError
 from bench.extractors.hloc import Hloc
 from bench.extractors.sift import Sift
 from bench.images import photographs
+from bench.images.views import extract_views
 from bench.testing import check_extractor
 from defenses.affine import Affine
 
@@ -51,6 +52,14 @@ def features(tmp_path: Path, name: str = "street/a.png", **datasets: Any) -> Pat
 
 def extract(path: Path, photograph: Path, **more: Any) -> Any:
     return Hloc(path=path, **more).extract(photographs.read(photograph).pixels, photograph)
+
+
+def test_mirrored_views_have_no_stored_features(tmp_path: Path, photograph: Path) -> None:
+    """Training would otherwise pair mirrored pixels with the features of the unmirrored photograph."""
+    views = extract_views(photographs.Source(name="a", path=photograph), Hloc(path=features(tmp_path)))
+    assert len(next(views).features) > 0
+    with pytest.raises(UserError, match="Training and dictionaries use mirrored views"):
+        next(views)
 
 
 def test_declared_properties_of_descriptors_decide_which_attacks_apply(tmp_path: Path) -> None:
