@@ -39,8 +39,8 @@ class ColmapDatabase(Extractor):
 
         if source is None:
             raise UserError(
-                "colmap-database: features are found by the photograph's file, but this image has none. Training and dictionaries "
-                "use mirrored views: choose an extractor that computes features"
+                "colmap-database: features are found by the photograph's file, but this image has none. Training and "
+                "dictionaries use mirrored views: choose an extractor that computes features"
             )
         numbers = _list_images(self.path, self.path.stat().st_mtime_ns)
         name = match_name(source, numbers)
