@@ -96,7 +96,7 @@ def read_plan(out: Path) -> list[dict[str, Any]]:
     except FileNotFoundError:
         raise UserError(f"{path}: no such file; nothing was run there") from None
     except ValueError as error:
-        raise UserError(f"{path}: no JSON ({error}); repeat the run to write the file again") from None
+        raise UserError(f"{path}: not valid JSON ({error}); repeat the run to write the file again") from None
     if not all("experiments" in plan and "samples" in plan for plan in plans):
         raise UserError(f"{path}: written by another version of this program; repeat the run to write the file again")
     return plans

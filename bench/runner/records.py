@@ -239,7 +239,7 @@ def _parse(path: Path, number: int, line: bytes) -> Record:
     try:
         record = json.loads(line)
     except (ValueError, RecursionError) as error:
-        raise UserError(f"{path}, line {number}: no JSON ({error}); repair or remove the line") from error
+        raise UserError(f"{path}, line {number}: not valid JSON ({error}); repair or remove the line") from error
     if (fault := explain_invalid(record)) is not None:
         raise UserError(f"{path}, line {number}: {fault}; repair or remove the line")
     return upgrade(record)
