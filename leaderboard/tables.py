@@ -122,7 +122,7 @@ def _build_table(records: list[Record], brief: bool, foldable: bool) -> Table:
             )
             for row in rows
         ),
-        remarks=(*failures, *chance, *remarks) if brief else (*_explain_metrics(metrics), *remarks, *failures),
+        remarks=(*failures, *chance, *remarks) if brief else (*_explain_metrics(metrics), *chance, *remarks, *failures),
         note_column=1,  # the attack
     )
 
@@ -201,9 +201,9 @@ def _label_metric(name: str) -> str:
 
 
 def _explain_metrics(metrics: Sequence[str]) -> list[str]:
+    """Return the descriptions of all metrics but `identified`, which `REMARK` explains."""
     plugins = {plugin.name(): plugin for plugin in discovery.load_plugins(discovery.METRIC)}
-    chance = [REMARK] if IDENTIFIED in metrics else []
-    return [*(f"{name}: {plugins[name].description()}" for name in metrics if name in plugins and name != IDENTIFIED), *chance]
+    return [f"{name}: {plugins[name].description()}" for name in metrics if name in plugins and name != IDENTIFIED]
 
 
 def _list_notes(records: list[Record], completed: list[Record], signal: Signal | None) -> list[str]:
