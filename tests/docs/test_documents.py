@@ -40,6 +40,7 @@ LONG = {
         "--validation unseen/ --steps 1 --batch 2 --widths 8,8 --devices 2"
     ),
 }
+LONG_PAGES = {"docs/formats", "docs/service-cost"}  # pages whose commands take many seconds together
 # Commands that are parsed only, by their beginnings, with the reason.
 UNTESTED = {
     "reproduce figure-inlier": "minutes; test_reproduce.py runs it in the profile smoke",
@@ -65,9 +66,8 @@ def folder(tmp_path: Path) -> Path:
     return folder
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow if name == "README" else pytest.mark.exhaustive) for name in EXECUTED]
-)
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("name", EXECUTED)
 def test_examples_run_as_printed(name: str, folder: Path, environment: Path) -> None:
     if not name.startswith(TUTORIALS):
         for number, photograph in enumerate(list_builtin()):
@@ -183,7 +183,9 @@ def workspace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", LISTED)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.exhaustive if name in LONG_PAGES else ()) for name in LISTED]
+)
 def test_listed_commands_run(
     name: str, workspace: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -288,7 +288,7 @@ def test_the_site_marks_it(tmp_path: Path) -> None:
 # ---- a network that has learned nothing
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_network_with_shuffled_weights_is_marked(
     tmp_path: Path, rng: np.random.Generator, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -91,7 +91,7 @@ def test_contract_test_fails_for_a_wrong_defense(tmp_path: Path) -> None:
     assert "the released keypoints differ from the secret ones" in done.stdout
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_installed_packages_run_with_every_attack(tmp_path: Path) -> None:
     """Packages are installed by pip; the project is unchanged."""
     (tmp_path / "album").mkdir()
