@@ -40,7 +40,6 @@ LONG = {
         "--validation unseen/ --steps 1 --batch 2 --widths 8,8 --devices 2"
     ),
 }
-LONG_PAGES = {"docs/formats", "docs/service-cost"}  # pages whose commands take many seconds together
 # Commands that are parsed only, by their beginnings, with the reason.
 UNTESTED = {
     "reproduce figure-inlier": "minutes; test_reproduce.py runs it in the profile smoke",
@@ -182,10 +181,8 @@ def workspace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.exhaustive if name in LONG_PAGES else ()) for name in LISTED]
-)
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("name", LISTED)
 def test_listed_commands_run(
     name: str, workspace: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -30,8 +30,10 @@ def test_all_commands_are_found() -> None:
     assert len(COMMANDS) == PAGE.count("```\nbench ") == 6
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize(
+    "command",
+    [pytest.param(command, marks=pytest.mark.exhaustive if command == MILLION else pytest.mark.slow) for command in COMMANDS],
+)
 def test_commands_run(command: str, capfd: pytest.CaptureFixture[str]) -> None:
     """The audit of a million trials takes some seconds, and finds ε between 1.94 and 2."""
     assert cli.main(shlex.split(command)) == 0

@@ -148,7 +148,7 @@ def test_two_processes_resume_the_training_of_one(tmp_path, monkeypatch):
     np.testing.assert_allclose(read_losses(tmp_path / "log-parts"), read_losses(tmp_path / "log-whole"), rtol=1e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_user_error_in_a_process_is_reported_in_one_line(tmp_path, capsys):
     folder = tmp_path / "photos"
     folder.mkdir()

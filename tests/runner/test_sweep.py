@@ -225,7 +225,7 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
         yield local_cluster
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_two_workers_one_of_them_killed(images: Path, small: Asset, tmp_path: Path, cluster: Any) -> None:
     """No record is lost or duplicated, and records and reconstructions equal those of one process."""
     (images / "bad.jpg").write_bytes(b"no photograph")
