@@ -34,6 +34,7 @@ from bench.localization import maps
 from bench.localization.scene_index import SceneIndex
 from bench.task_api import Outcome, ProtectedImage, Task, Trial
 from bench.tasks.reconstruction import Reconstruction, build_view
+from bench.threat_model import TrueWords
 from bench.types import Descriptors, Features, Floats, Indices, Release, Subspaces, WordSets
 
 TOLERANCE = 1e-5  # of norms and angles in float32
@@ -138,6 +139,8 @@ def _check_attack(
     if not isinstance(attack, ImageAttack):
         np.testing.assert_allclose(np.linalg.norm(estimate, axis=1), 1, atol=TOLERANCE)
     assert estimate.dtype == np.float32
+    if TrueWords in attack.needs:
+        return  # an oracle reads a part of the secret, by declaration
     for array in (*_arrays(mine), *quantised):
         array[...] = 0
     for entry in store.list_entries():

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
-from bench.types import Bytes, Release
+from bench.types import Bytes, Indices, Release
 
 if TYPE_CHECKING:
     from bench.codebook.public import Public
@@ -65,6 +65,18 @@ class PublicAssets(Knowledge):
     description = "networks trained on public photographs, and public dictionaries"
 
     assets: Public
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TrueWords(Knowledge):
+    """The position of the true word in each released set. It is part of the secret: no attacker has it.
+
+    An attack that needs it is an oracle: a ceiling for attacks that select words, and no evidence of leakage.
+    """
+
+    description = "the true words, which no attacker knows"
+
+    candidates: Indices  # (N,) index of the true word among the candidates; m if it is none of them
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

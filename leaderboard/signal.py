@@ -26,6 +26,7 @@ from leaderboard.chance import IDENTIFIED, LOG_RECIPROCAL_RANK
 from leaderboard.intervals import LEVEL, MIN_SAMPLES, Estimate, Interval, correct_holm, estimate_mean
 
 BASELINES = ("blank", "keypoints")  # names of attacks
+REFERENCES = ("oracle",)  # names of attacks with knowledge that no attacker has
 SIGNIFICANCE = (1 - LEVEL) / 2  # one-sided: that of the lower end of a two-sided interval
 # The values that are compared, by metric. The logarithm of the reciprocal rank is the information about the photograph, in bits.
 METRICS: Mapping[str, Callable[[float], float]] = {"ssim": float, IDENTIFIED: math.log2}
@@ -47,6 +48,7 @@ class Verdict(Enum):
     ABSENT = "no signal: attack at baseline"
     UNTESTED = "not tested"
     BASELINE = "baseline"
+    REFERENCE = "reference"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,7 +89,7 @@ class Signal:
 
     @property
     def word(self) -> str:
-        """The verdict for a column: "yes", "no", "not tested" or "baseline"."""
+        """The verdict for a column: "yes", "no", "not tested", "baseline" or "reference"."""
         return {Verdict.SIGNAL: "yes", Verdict.ABSENT: "no"}.get(self.verdict, self.verdict.value)
 
 
@@ -179,6 +181,8 @@ def _judge(number: int, experiments: Sequence[ExperimentRecords], values: Sequen
     own = experiments[number]
     if is_baseline(own[0]):
         return Signal(verdict=Verdict.BASELINE)
+    if get_attack(own[0]) in REFERENCES:
+        return Signal(verdict=Verdict.REFERENCE)
     baselines = [(name, values[index]) for name in BASELINES for index in _find_baselines(name, own, experiments)]
     return judge_signal(values[number], baselines)
 

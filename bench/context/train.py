@@ -18,6 +18,7 @@ from torch import Tensor
 
 from bench.api import Defense
 from bench.codebook.public import Public
+from bench.codebook.true_words import find_true_candidates, find_true_words
 from bench.context.encoding import build_graph, prior_odds
 from bench.context.network import Belief, ContextModel, KeypointGraph, Shape
 from bench.core.device import pick_device
@@ -25,7 +26,7 @@ from bench.core.progress import Progress
 from bench.images.views import PhotographView
 from bench.inversion.data import SupportedSettings, draw_crop
 from bench.inversion.plan import Training
-from bench.types import Features, Indices, WordSets
+from bench.types import Features, WordSets
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,10 +48,9 @@ def build_example(
     releases, odds, labels = [], [], []
     for secret, defense in zip(secrets, defenses, strict=True):
         release = defense.protect(secret, public, rng)
-        if not isinstance(release, WordSets) or release.words is None:
+        if not isinstance(release, WordSets):
             raise TypeError(f"{defense.name()} releases no words of a dictionary")
-        true = release.words == find_true_words(defense, secret, public)[:, None]  # (N, m)
-        labels.append(np.where(true.any(axis=1), true.argmax(axis=1), release.subset_size))
+        labels.append(find_true_candidates(release, find_true_words(defense, secret, public)))
         odds.append(prior_odds(defense, public, release.subset_size))
         releases.append(release)
     return Example(
@@ -58,14 +58,6 @@ def build_example(
         torch.from_numpy(np.concatenate(labels)),
         torch.from_numpy(np.concatenate([secret.descriptors for secret in secrets])),
     )
-
-
-def find_true_words(defense: Defense, secret: Features, public: Public) -> Indices:
-    """Return the words that a defense quantises descriptors to. -> (N,)"""
-    if defense.dictionary_field is None:
-        raise TypeError(f"{defense.name()} does not quantise")
-    words = 0 if defense.word_count_field is None else getattr(defense, defense.word_count_field)
-    return public.nearest_words(getattr(defense, defense.dictionary_field), secret, words)
 
 
 def build_sampler(

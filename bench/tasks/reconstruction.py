@@ -13,6 +13,7 @@ import numpy as np
 from bench.api import Attack, Dataset, Defense, Extractor, ImageAttack, LocalMetric, Metric, Selection, View
 from bench.cache import attack_cache
 from bench.codebook.public import Public
+from bench.codebook.true_words import find_true_candidates, find_true_words
 from bench.core.errors import SampleError, UserError, wrap_plugin_errors
 from bench.images import samples
 from bench.images.samples import Collection, Images
@@ -27,8 +28,9 @@ from bench.threat_model import (
     PublicDatabase,
     RepeatedReleases,
     ServerMap,
+    TrueWords,
 )
-from bench.types import Descriptors, Floats, Points
+from bench.types import Descriptors, Floats, Points, WordSets
 
 RELEASES = {OtherReleases, RepeatedReleases}  # available for every defense
 
@@ -54,7 +56,9 @@ class Reconstruction(Task):
     def explain_not_applicable(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> str | None:
         if attack is None:
             return "reconstruction needs an attack"
-        served = {ServerMap} if public.scene_index is not None else set()
+        served: set[type[Knowledge]] = {ServerMap} if public.scene_index is not None else set()
+        if defense.dictionary_field is not None and issubclass(defense.releases, WordSets):
+            served.add(TrueWords)
         missing = attack.needs - offer_knowledge(attack, defense, public).keys() - RELEASES - served
         if missing:
             wanted = " and ".join(sorted(need.description for need in missing))
@@ -126,6 +130,7 @@ def build_view(trial: Trial) -> View:
         OtherReleases: lambda: OtherReleases(draw=lambda count: map(copy.deepcopy, trial.others(count))),
         RepeatedReleases: lambda: RepeatedReleases(releases=copy.deepcopy(trial.repeats)),
         ServerMap: lambda: _build_server_map(trial),
+        TrueWords: lambda: _find_true_words(trial),
     }
     return View(
         release=copy.deepcopy(trial.release),  # an attack cannot change the input of the next attack
@@ -139,6 +144,11 @@ def _build_server_map(trial: Trial) -> ServerMap:
     from bench.localization.server import Server  # it imports COLMAP
 
     return ServerMap(server=Server(public=trial.public, camera=trial.sample.subject.camera))
+
+
+def _find_true_words(trial: Trial) -> TrueWords:
+    true = find_true_words(trial.defense, trial.secret, trial.public)
+    return TrueWords(candidates=find_true_candidates(trial.release, true))
 
 
 def reconstruct_image(attack: ImageAttack, view: View, trial: Trial) -> Floats:
