@@ -18,7 +18,7 @@ from bench.core.hashing import canonical_json
 from leaderboard.comparison import ComparisonGroup, GroupedExperiment
 from leaderboard.intervals import Interval
 from leaderboard.measures import PRIVACY, Measure, list_measures
-from leaderboard.signal import BASELINES, REFERENCES, Signal, Verdict, is_baseline
+from leaderboard.signal import BASELINES, Signal, Verdict, is_baseline, is_oracle
 
 ADAPTED = "dia"  # the attack whose network is trained for the defense; without it, a defense may look safe
 
@@ -71,7 +71,7 @@ def average_baselines(group: ComparisonGroup, condition: str | None = None) -> d
 
 
 def _judge_defense(group: ComparisonGroup, experiments: Sequence[GroupedExperiment], privacy: Measure) -> Standing:
-    attacks = [one for one in experiments if (one.metadata["attack"] or {}).get("name") not in REFERENCES]
+    attacks = [one for one in experiments if not is_oracle(one.metadata)]
     scores = [(score, one) for one in attacks if (score := group.average(one, privacy)) is not None]
     score, strongest = max(scores, key=lambda pair: _strength(group.signals.get(pair[1]), pair[0]), default=(None, None))
     signal = group.signals.get(strongest) if strongest else None

@@ -26,7 +26,7 @@ from leaderboard.chance import IDENTIFIED, LOG_RECIPROCAL_RANK
 from leaderboard.intervals import LEVEL, MIN_SAMPLES, Estimate, Interval, correct_holm, estimate_mean
 
 BASELINES = ("blank", "keypoints")  # names of attacks
-REFERENCES = ("oracle",)  # names of attacks with knowledge that no attacker has
+ORACLES = ("oracle",)  # names of attacks with knowledge that no attacker has
 SIGNIFICANCE = (1 - LEVEL) / 2  # one-sided: that of the lower end of a two-sided interval
 # The values that are compared, by metric. The logarithm of the reciprocal rank is the information about the photograph, in bits.
 METRICS: Mapping[str, Callable[[float], float]] = {"ssim": float, IDENTIFIED: math.log2}
@@ -162,6 +162,11 @@ def is_baseline(record: Record) -> bool:
     return get_attack(record) in BASELINES
 
 
+def is_oracle(record: Record) -> bool:
+    """Return whether the record is of an oracle, which knows a part of the secret."""
+    return get_attack(record) in ORACLES
+
+
 def get_attack(record: Record) -> str | None:
     """Return the name of the attack; None if the task takes no attack."""
     return record["attack"] and str(record["attack"]["name"])
@@ -181,7 +186,7 @@ def _judge(number: int, experiments: Sequence[ExperimentRecords], values: Sequen
     own = experiments[number]
     if is_baseline(own[0]):
         return Signal(verdict=Verdict.BASELINE)
-    if get_attack(own[0]) in REFERENCES:
+    if is_oracle(own[0]):
         return Signal(verdict=Verdict.REFERENCE)
     baselines = [(name, values[index]) for name in BASELINES for index in _find_baselines(name, own, experiments)]
     return judge_signal(values[number], baselines)

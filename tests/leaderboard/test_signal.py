@@ -226,6 +226,19 @@ def test_the_strongest_attack_has_a_signal_if_any_has(tmp_path: Path) -> None:
     assert (standing.strongest.attack, standing.rank) == ("dia", None)
 
 
+def test_an_oracle_is_a_reference_and_never_the_strongest_attack(tmp_path: Path) -> None:
+    """Control: with the same scores under another name, it is the strongest."""
+    records = [*reconstructions(NONE, [0.5 + number / 100 for number in range(7)]), *baselines(NONE, 7)]
+    for name, strongest, verdict in (("oracle", "dia", Verdict.REFERENCE), ("other", "other", Verdict.SIGNAL)):
+        better = reconstructions(NONE, [0.8 + number / 100 for number in range(7)], attack={"name": name})
+        group = build_group(tmp_path / name, [*records, *better])
+        (standing,) = rank_defenses(group)
+        assert standing.strongest is not None
+        assert standing.strongest.metadata["attack"]["name"] == strongest
+        (own,) = [one for one in group.experiments if one.metadata["attack"]["name"] == name]
+        assert group.signals[own].verdict is verdict
+
+
 def test_tables_of_the_leaderboard_mark_it_in_every_format(tmp_path: Path) -> None:
     group = build_group(tmp_path, list_records())
     table, ranking = build_pairs_table(group), build_ranking_table(group)

@@ -145,9 +145,10 @@ def test_the_inlier_attack_verifies_what_the_server_can_localize(dataset: Path) 
     inliers: dict[str, list[int]] = {}
     for record in found:
         inliers.setdefault(record["defense"]["name"], []).append(int(record["notes"][-1].split()[0]))
-    assert min(inliers["none"]) > 40
+    assert min(inliers["none"]) > 100
     assert np.mean(inliers["affine"]) > np.mean(inliers["none"])  # of one reference's points
-    assert max(inliers["ldp"]) < 30  # chance: the dictionary, and with it the number, changes with the digest of our source
+    # The digest of our source enters the seed of this release. Over eight seeds the greatest number was 16 to 24.
+    assert max(inliers["ldp"]) < 30
 
 
 # ---- controls
