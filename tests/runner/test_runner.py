@@ -16,7 +16,7 @@ from fake_plugins.broken import Broken
 from fake_plugins.glimpse import Glimpse
 from fake_plugins.guess import Guess
 from fake_plugins.sketch import Sketch
-from fakes import FAKES, install_plugins, prepare_plan, write_album
+from fakes import FAKES, install_plugins, prepare_plan
 from PIL import Image
 
 from attacks.repeat import Repeat
@@ -43,16 +43,6 @@ RECONSTRUCTION = Reconstruction(inverter="sketch")
 @pytest.fixture(autouse=True)
 def _fakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     install_plugins(tmp_path / "installed", monkeypatch, FAKES)
-
-
-@pytest.fixture
-def images(tmp_path: Path) -> Path:
-    return write_album(tmp_path / "album")
-
-
-@pytest.fixture
-def small(tmp_path: Path) -> Asset:
-    return write_dictionary(tmp_path)
 
 
 def run(defenses: list[Defense], attacks: list[Attack], images: Any, task: Task = RECONSTRUCTION, **more: Any) -> list[Record]:
