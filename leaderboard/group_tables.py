@@ -16,9 +16,19 @@ from leaderboard.comparison import ComparisonGroup, GroupedExperiment
 from leaderboard.intervals import LEVEL, Interval
 from leaderboard.measures import Measure
 from leaderboard.ranking import Standing, rank_defenses
-from leaderboard.tables import COMPOSITION_REMARK, SEED_REMARK, format_chance, format_number, spent_epsilon
+from leaderboard.tables import (
+    COMPOSITION_REMARK,
+    SEED_REMARK,
+    format_chance,
+    format_fraction,
+    format_interval,
+    format_number,
+    spent_epsilon,
+)
 
 Value = Interval | float | int | str | None
+
+RANK_1_COLUMNS = tuple(map(chance.name_rank_1, chance.IDENTIFICATION))  # a condition may follow
 
 INTERVAL_REMARK = (
     f"In brackets: the {LEVEL:.0%} interval of Student's t over the samples, or Wilson's if each sample succeeds or fails. "
@@ -101,7 +111,8 @@ _GUARANTEES = {
 
 def _list_signal_remarks(group: ComparisonGroup) -> list[str]:
     """Return the remarks on signals, chance and baselines that are missing."""
-    chance_remark = [chance.REMARK] if any(measure.name == chance.IDENTIFIED for measure in group.measures) else []
+    metrics = [measure.name for measure in group.measures if measure.name in chance.IDENTIFICATION]
+    chance_remark = [chance.explain_identification(metric) for metric in metrics]
     untested = signal.explain_untested(list(group.signals.values()))
     return [signal.REMARK, *chance_remark, *([untested] if untested else [])]
 
@@ -210,8 +221,9 @@ def _format_value(name: str, value: Value, count: int | None) -> str:
     if name == "log10_true" and isinstance(value, float):
         return format_chance(value)
     if isinstance(value, Interval):
-        ends = f" [{format_number(value.low)}, {format_number(value.high)}]" if math.isfinite(value.low) else ""
-        return format_number(value.mean) + ends + (f" (n = {value.count})" if value.count != count else "")
+        if name.startswith(RANK_1_COLUMNS):
+            return format_fraction(value)
+        return format_interval(value) + (f" (n = {value.count})" if value.count != count else "")
     return format_number(value) if isinstance(value, float) else str(value)
 
 

@@ -84,7 +84,7 @@ def test_each_seed_has_a_group_and_their_mean_has_one(tmp_path: Path) -> None:
     assert [group.seeds for group in (averaged, first, second)] == [(1, 2), (1,), (2,)]
     assert [len(group.experiments) for group in (averaged, first, second)] == [1, 1, 2]  # ldp lacks a seed, and is not averaged
     (ssim,) = list_measures(["ssim"])
-    assert averaged.list_values(averaged.experiments[0], "ssim") == [pytest.approx(0.4), pytest.approx(0.6)]
+    assert averaged.list_values(averaged.experiments[0], ssim) == [pytest.approx(0.4), pytest.approx(0.6)]
     interval = averaged.average(averaged.experiments[0], ssim)
     assert interval is not None
     assert interval.count == 2  # photographs, not photographs times seeds
@@ -94,7 +94,7 @@ def test_each_seed_has_a_group_and_their_mean_has_one(tmp_path: Path) -> None:
 def test_a_sample_that_one_seed_lacks_is_not_averaged(tmp_path: Path) -> None:
     other = reconstructions(ldp(8.0), [0.3, 0.5], seed=1), reconstructions(ldp(8.0), [0.3, 0.5], seed=2)
     averaged, *_ = build(tmp_path, reconstructions(NONE, [0.5, 0.9], seed=1), reconstructions(NONE, [0.3], seed=2), *other)
-    assert averaged.list_values(averaged.experiments[0], "ssim") == [pytest.approx(0.4)]
+    assert averaged.list_values(averaged.experiments[0], *list_measures(["ssim"])) == [pytest.approx(0.4)]
     assert averaged.count_missing(averaged.experiments[0]) == 1
     assert by_defense(averaged)["none"].unranked_reason == "dia has completed 1 of 2 samples"
 

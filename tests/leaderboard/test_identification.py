@@ -8,6 +8,7 @@ import pytest
 from scipy.optimize import minimize
 from scipy.stats import binom, binomtest, norm, sem, t
 
+from bench.core.errors import UserError
 from leaderboard.chance import PHOTOGRAPHS, RECIPROCAL_RANK
 from leaderboard.identification import (
     _evaluate_codes,
@@ -203,5 +204,5 @@ def test_mean_reciprocal_rank_of_others_has_students_interval(rng: np.random.Gen
 
 @pytest.mark.parametrize("values", [[], [0.0], [1.1], [float("nan")], [[1.0]], [1 / 257]], ids=str)
 def test_other_values_are_refused(values: list) -> None:
-    with pytest.raises(ValueError, match="reciprocal ranks"):
+    with pytest.raises((ValueError, UserError), match="reciprocal ranks"):
         summarize_identification(values)
