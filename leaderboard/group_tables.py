@@ -14,7 +14,7 @@ from bench.runner.records import Record
 from leaderboard import chance, signal
 from leaderboard.comparison import ComparisonGroup, GroupedExperiment
 from leaderboard.intervals import LEVEL, Interval
-from leaderboard.measures import Measure
+from leaderboard.measures import Measure, list_measures
 from leaderboard.ranking import Standing, rank_defenses
 from leaderboard.tables import (
     COMPOSITION_REMARK,
@@ -36,9 +36,11 @@ INTERVAL_REMARK = (
 )
 NOT_APPLICABLE_REMARK = f"{NOT_APPLICABLE} without a note: the metric does not apply to the result of the attack."
 RANK_REMARK = (
-    "Rank: by the strongest attack, the one with the greatest mean SSIM among the attacks with a signal. The best values of "
-    "ranked defenses are bold. A defense is unranked and comes last if no attacker was adapted to it, if an attack has not "
-    "completed all samples, or if no attack has a signal: the benchmark cannot say how private it is."
+    "Rank: by the sum of the positions in SSIM and in identified, each of the attack with the greatest mean among those with a "
+    "signal. Of equal sums, the lower identified comes first. The strongest attack is that of the greatest mean SSIM among those "
+    "with a signal; of equal ones, that of the greater identified. The best values of ranked defenses are bold. A defense is "
+    "unranked and comes last if no attacker was adapted to it, if an attack has not completed all samples, or if no attack has a "
+    "signal: the benchmark cannot say how private it is."
 )
 
 
@@ -227,11 +229,22 @@ def _format_value(name: str, value: Value, count: int | None) -> str:
     return format_number(value) if isinstance(value, float) else str(value)
 
 
+def _get_mean(group: ComparisonGroup, experiment: GroupedExperiment) -> float:
+    """Return the mean reciprocal rank of an experiment; 0 if it has none."""
+    (identified,) = list_measures([chance.IDENTIFIED])
+    average = group.average(experiment, identified)
+    return average.mean if average else 0.0
+
+
 def _list_notes(group: ComparisonGroup, experiment: GroupedExperiment, standing: Standing | None) -> Iterator[str]:
     """Yield the reasons for a missing rank or missing values, the failures, and the notes that all records have."""
     unranked_reason = standing.unranked_reason if standing else None
     if unranked_reason:
         yield f"unranked: {unranked_reason}"
+    if standing and standing.identifying and experiment is standing.strongest and standing.identifying is not experiment:
+        assert standing.identification is not None
+        if standing.identification.mean > _get_mean(group, experiment):
+            yield f"ranked by {format_number(standing.identification.mean)} identified by {standing.identifying.attack}"
     if experiment.reason:
         if experiment.reason != unranked_reason:
             yield experiment.reason

@@ -103,6 +103,16 @@ def test_order_and_copies_do_not_matter(rng: np.random.Generator) -> None:
     assert twice.high - twice.low < first.high - first.low
 
 
+def test_seeds_of_a_photograph_do_not_count_as_photographs(rng: np.random.Generator) -> None:
+    values = 1 / rng.integers(1, 60, 40)
+    once = measure_bits(values)
+    assert measure_bits(np.stack([values] * 3, axis=1)) == once
+    by_seed = 1 / rng.integers(1, 60, (40, 2))
+    together, all_separate = measure_bits(by_seed), measure_bits(by_seed.ravel())
+    assert (together.mean, together.count) == (pytest.approx(all_separate.mean), 40)
+    assert together.high - together.low > all_separate.high - all_separate.low
+
+
 # ---- bias and coverage
 
 
