@@ -102,7 +102,7 @@ def measure_bits(reciprocals: ArrayLike) -> Interval:
 
 
 def measure_reciprocal(reciprocals: ArrayLike) -> Interval:
-    """Return the mean reciprocal rank, with Student's interval within the range of the metric.
+    """Return the mean reciprocal rank, with Student's interval within the range of the metric. It is infinite for one value.
 
     A constant image counts as its expectation if its tie is broken at random. The reciprocal of its mean rank is less than that
     of a random order on average, so that random images would seem better than constant ones.
@@ -115,6 +115,8 @@ def measure_reciprocal(reciprocals: ArrayLike) -> Interval:
         if a value is no reciprocal rank among 256.
     """
     mean = interval(replace_ties(reciprocals))
+    if math.isinf(mean.low):
+        return mean
     return Interval(mean.mean, max(1 / PHOTOGRAPHS, mean.low), min(1.0, mean.high), mean.count)
 
 
