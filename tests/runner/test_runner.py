@@ -414,6 +414,7 @@ def test_selected_keypoints_alone_are_scored_and_reconstructed(images: Path, mon
     )
     found = run([Undefended()], [Glimpse()], images)
     assert [record["metrics"]["l2"] for record in found] == [0, 0]
+    assert "identified-scene" not in found[0]["metric_settings"], "photographs have no other views"
     assert seen == [-(-record["metrics"]["keypoints"] // 2) for record in found]
 
 
@@ -432,3 +433,5 @@ def test_foreground_and_background_of_a_scene_are_scored_separately(tmp_path: Pa
     assert found["mae_foreground"] != found["mae_background"]
     assert record["condition"] == "day"
     assert record["dataset"]["spec"]["name"] == "gallery"
+    assert "identified-scene" in found
+    assert "identified-scene" in record["metric_settings"]
