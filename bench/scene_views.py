@@ -22,6 +22,7 @@ from bench.datasets.gallery import Rendered, render
 from bench.identification import distractors, thumbnails
 from bench.identification.thumbnails import Doubles
 from bench.images.scene import Mask, Reference, SceneImage
+from bench.types import Floats
 
 WIDTH = 96  # pixels of the small renderings
 SMALLEST = 32  # pixels of a side of the gallery's images
@@ -44,7 +45,7 @@ class Glance:
     def find_visible(self, points: Doubles) -> Mask:
         """Return whether each point of the world is seen in this view. (n, 3) -> (n,)"""
         height, width = self.depth.shape
-        known = np.isfinite(points).all(axis=1)
+        known = np.asarray(np.isfinite(points).all(axis=1))
         seen = np.where(known[:, None], points, 0.0) @ self.projection[:, :3].T + self.projection[:, 3]
         depth = np.where(known, seen[:, 2], -1.0)
         column, row = (np.floor(seen[:, axis] / np.maximum(depth, 1e-6)) for axis in (0, 1))
@@ -53,7 +54,7 @@ class Glance:
         return np.asarray(inside & (np.abs(depth - surface) < DEPTH_TOLERANCE * depth))
 
 
-def list_candidates(query: SceneImage, references: Sequence[Reference]) -> Doubles | None:
+def list_candidates(query: SceneImage, references: Sequence[Reference]) -> Floats | None:
     """Return the thumbnails of another view of the query's scene, and of 255 views of others. -> (256, 16, 16)
 
     None if no other view of the scene is known.
@@ -70,7 +71,8 @@ def list_candidates(query: SceneImage, references: Sequence[Reference]) -> Doubl
     count = min(len(others), distractors.COUNT)
     spread = others[np.linspace(0, len(others) - 1, count).round().astype(int)] if count else others
     photographs = distractors.load_distractors().thumbnails[: distractors.COUNT - count]
-    return np.concatenate([np.stack([views[index].thumbnail for index in (target, *spread)]), photographs])
+    thumbs = np.concatenate([np.stack([views[index].thumbnail for index in (target, *spread)]), photographs])
+    return thumbs.astype(np.float32)
 
 
 def measure_shared(query: Glance, references: Sequence[Glance]) -> Doubles:

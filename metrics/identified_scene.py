@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, ClassVar, Literal
 
+import numpy as np
+
 from bench.api import Metric
 from bench.identification import distractors, thumbnails
 from bench.types import Floats
@@ -32,7 +34,7 @@ class IdentifiedScene(Metric):
 
     def __call__(self, truth: Floats, estimate: Floats) -> float:
         # truth: (256, 16, 16) thumbnails, the other view of the scene first; estimate: (H, W, 3) in [0, 1]
-        similarities = thumbnails.compare_shifted(thumbnails.compute_thumbnail(estimate), truth, SHIFT)
+        similarities = thumbnails.compare_shifted(thumbnails.compute_thumbnail(estimate), truth.astype(np.float64), SHIFT)
         return 1 / thumbnails.rank_first(similarities)
 
 

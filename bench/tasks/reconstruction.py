@@ -15,7 +15,6 @@ from bench.api import Attack, Dataset, Defense, Extractor, ImageAttack, LocalMet
 from bench.cache import attack_cache
 from bench.codebook.public import Public
 from bench.core.errors import SampleError, UserError, wrap_plugin_errors
-from bench.identification.thumbnails import Doubles
 from bench.images import samples
 from bench.images.samples import Collection, Images
 from bench.images.scene import Mask
@@ -175,7 +174,7 @@ def compute_metrics(trial: Trial, selection: Selection | None, image: Floats | N
     return Outcome(metrics=values, image=image, notes=notes)
 
 
-def list_views(trial: Trial) -> Doubles | None:
+def list_views(trial: Trial) -> Floats | None:
     """Return another view of the sample's scene and 255 views of others, (256, 16, 16); None if the sample has no scene."""
     index = trial.public.scene_index
     return None if index is None else scene_views.list_candidates(trial.sample.subject, index.scene.references)
@@ -193,7 +192,7 @@ def compute_part_metrics(metrics: Sequence[Metric], truth: Floats, image: Floats
     return values
 
 
-def _compute_metric(metric: Metric, truth: Floats | Doubles, estimate: Floats) -> float | None:
+def _compute_metric(metric: Metric, truth: Floats, estimate: Floats) -> float | None:
     with wrap_plugin_errors(f"plugin {metric.name()}"):
         value = metric(truth, estimate)
         if value is not None and not np.isfinite(value):
