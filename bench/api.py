@@ -242,7 +242,8 @@ def require_subspaces(view: View) -> tuple[Subspaces, int]:
 class Metric(Plugin, ABC):
     """A pure function of the truth and an estimate."""
 
-    compares: ClassVar[Literal["images", "descriptors"]]
+    # "views" compares a reconstruction with other views of its scene, and is computed on datasets alone.
+    compares: ClassVar[Literal["images", "descriptors", "views"]]
     unit: ClassVar[str]
     range: ClassVar[tuple[float, float]]
     higher_is_better_for: ClassVar[Literal["attacker", "defender"]]
@@ -257,7 +258,11 @@ class Metric(Plugin, ABC):
 
     @abstractmethod
     def __call__(self, truth: Floats, estimate: Floats) -> float | None:
-        """Return the value; None if it is not finite. Images are (H, W, 3) in [0, 1], descriptors are (N, D)."""
+        """Return the value; None if it is not finite. Images are (H, W, 3) in [0, 1], descriptors are (N, D).
+
+        For "views", the truth has (256, 16, 16) thumbnails (`bench.identification`): another view of the scene, then views of
+        others. The estimate is an image.
+        """
 
 
 class LocalMetric(Metric):

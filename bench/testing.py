@@ -28,6 +28,7 @@ from bench.codebook.examples import draw_features
 from bench.codebook.public import Public
 from bench.formats import tensor_file
 from bench.geometry.nearest_words import unit_rows
+from bench.identification import distractors, thumbnails
 from bench.images import photographs
 from bench.images.samples import Sample
 from bench.localization import maps
@@ -153,15 +154,19 @@ def _check_attack(
 def check_metric(metric: Metric, seed: int = 0) -> None:
     """Check a metric: its values are in its range, it changes no argument, and the truth scores better than noise."""
     rng = np.random.default_rng(seed)
-    if metric.compares == "images":
+    if metric.compares == "descriptors":
+        truth, estimate = draw_features(30, seed).descriptors, draw_features(30, seed + 1).descriptors
+        best_estimate = truth.copy()
+    else:
         # A portrait, since a metric such as `face` has no value for a picture without a face. The estimate is noise alone, since
         # a metric such as `identified` has its best value for a portrait under noise.
         truth = (photographs.read(photographs.list_people()[0].path).pixels / 255).astype(np.float32)
-        estimate = rng.random(truth.shape, np.float32)
-    else:
-        truth, estimate = draw_features(30, seed).descriptors, draw_features(30, seed + 1).descriptors
+        estimate, best_estimate = rng.random(truth.shape, np.float32), truth.copy()
+        if metric.compares == "views":
+            others = distractors.load_distractors().thumbnails[: distractors.COUNT]
+            truth = np.concatenate([thumbnails.compute_thumbnail(truth)[None], others])
     before = truth.copy(), estimate.copy()
-    perfect, value = metric(truth, truth.copy()), metric(truth, estimate)
+    perfect, value = metric(truth, best_estimate), metric(truth, estimate)
     assert np.array_equal(truth, before[0])
     assert np.array_equal(estimate, before[1])
     low, high = metric.range

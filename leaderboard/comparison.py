@@ -20,7 +20,7 @@ from bench.core.hashing import canonical_json, short_hash
 from bench.runner import records as files
 from bench.runner.records import FILE, Record
 from leaderboard.intervals import Interval
-from leaderboard.measures import PRIVACY, Measure, list_measures, summarize
+from leaderboard.measures import RANKING, Measure, expand_measures, summarize, summarize_bits
 from leaderboard.signal import Signal, judge_experiments
 from leaderboard.tables import FIRST_METRICS, build_labels, format_setting, label_extractor, name_samples
 
@@ -137,15 +137,26 @@ class ComparisonGroup:
         """Return the records of each sample that the experiment has completed with every seed."""
         return [records for records in experiment.by_sample if len(records) == len(self.seeds)]
 
-    def list_values(self, experiment: GroupedExperiment, metric: str, condition: str | None = None) -> list[float | None]:
-        """Return a metric of each complete sample, averaged over the seeds. A condition selects the samples of that condition."""
+    def list_values(self, experiment: GroupedExperiment, measure: Measure, condition: str | None = None) -> list[float | None]:
+        """Return a measure of each complete sample, averaged over the seeds. A condition selects samples."""
+        return [
+            _mean([measure.convert(float(value)) for value in values])
+            for values in self._list_values_by_seed(experiment, measure, condition)
+        ]
+
+    def _list_values_by_seed(self, experiment: GroupedExperiment, measure: Measure, condition: str | None) -> list[list[Any]]:
+        """Return the values in records, one list per complete sample."""
         samples = self.complete_samples(experiment)
         selection = [records for records in samples if condition is None or records[0].get("condition") == condition]
-        return [_mean([record["metrics"].get(metric) for record in records]) for records in selection]
+        values = [[record["metrics"].get(measure.metric) for record in records] for records in selection]
+        return [[value for value in each if value is not None] for each in values]
 
     def average(self, experiment: GroupedExperiment, measure: Measure, condition: str | None = None) -> Interval | None:
         """Return the measure's average over the samples; None if no sample has a value."""
-        return summarize(measure, self.list_values(experiment, measure.name, condition))
+        if measure.kind == "bits":
+            ranks = self._list_values_by_seed(experiment, measure, condition)
+            return summarize_bits([tuple(map(float, values)) for values in ranks if len(values) == len(self.seeds)])
+        return summarize(measure, self.list_values(experiment, measure, condition))
 
     def count_missing(self, experiment: GroupedExperiment) -> int:
         """Return the number of the group's samples that the experiment has not completed; 0 if it does not apply."""
@@ -213,19 +224,24 @@ def _build_group(parts: Sequence[Sequence[LocatedRecord]], seeds: tuple[int, ...
     completed = [record for experiment in experiments for record in experiment.completed]
     metrics = {name for record in completed for name, value in record["metrics"].items() if value is not None}
     conditions = {str(condition) for record in completed if (condition := record.get("condition")) is not None}
-    measures = list_measures(_order_metrics(metrics))
+    measures = expand_measures(_order_metrics(metrics))
     return ComparisonGroup(
         experiments=experiments,
         seeds=seeds,
         samples=tuple(dict.fromkeys(record["sample"] for record in completed)),
         conditions=tuple(sorted(conditions)) or (None,),
-        measures=tuple(sorted(measures, key=lambda measure: (measure.name != PRIVACY, measure.kind != "fraction"))),
+        measures=tuple(sorted(measures, key=lambda measure: (_order_ranking(measure), measure.kind != "fraction"))),
     )
 
 
 def _order_metrics(metrics: set[str]) -> list[str]:
     """Return the paper's metrics in its order, then the others by name."""
     return [*(name for name in FIRST_METRICS if name in metrics), *sorted(metrics - set(FIRST_METRICS))]
+
+
+def _order_ranking(measure: Measure) -> int:
+    """Return the position of a measure that ranks defenses; the others follow."""
+    return RANKING.index(measure.metric) if measure.metric in RANKING else len(RANKING)
 
 
 def _label_environments(first: Sequence[Record]) -> list[str]:
@@ -239,9 +255,8 @@ def _label_environments(first: Sequence[Record]) -> list[str]:
     ]
 
 
-def _mean(values: Sequence[Any]) -> float | None:
-    known = [float(value) for value in values if value is not None]
-    return sum(known) / len(known) if known else None
+def _mean(values: Sequence[float]) -> float | None:
+    return sum(values) / len(values) if values else None
 
 
 def _group_by(items: Iterable[T], key: Callable[[T], Any]) -> list[list[T]]:

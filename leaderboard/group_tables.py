@@ -14,11 +14,21 @@ from bench.runner.records import Record
 from leaderboard import chance, signal
 from leaderboard.comparison import ComparisonGroup, GroupedExperiment
 from leaderboard.intervals import LEVEL, Interval
-from leaderboard.measures import Measure
+from leaderboard.measures import Measure, list_measures
 from leaderboard.ranking import Standing, rank_defenses
-from leaderboard.tables import COMPOSITION_REMARK, SEED_REMARK, format_chance, format_number, spent_epsilon
+from leaderboard.tables import (
+    COMPOSITION_REMARK,
+    SEED_REMARK,
+    format_chance,
+    format_fraction,
+    format_interval,
+    format_number,
+    spent_epsilon,
+)
 
 Value = Interval | float | int | str | None
+
+RANK_1_COLUMNS = tuple(map(chance.name_rank_1, chance.IDENTIFICATION))  # a condition may follow
 
 INTERVAL_REMARK = (
     f"In brackets: the {LEVEL:.0%} interval of Student's t over the samples, or Wilson's if each sample succeeds or fails. "
@@ -26,9 +36,11 @@ INTERVAL_REMARK = (
 )
 NOT_APPLICABLE_REMARK = f"{NOT_APPLICABLE} without a note: the metric does not apply to the result of the attack."
 RANK_REMARK = (
-    "Rank: by the strongest attack, the one with the greatest mean SSIM among the attacks with a signal. The best values of "
-    "ranked defenses are bold. A defense is unranked and comes last if no attacker was adapted to it, if an attack has not "
-    "completed all samples, or if no attack has a signal: the benchmark cannot say how private it is."
+    "Rank: by the sum of the positions in SSIM and in identified, each of the attack with the greatest mean among those with a "
+    "signal. Of equal sums, the lower identified comes first. The strongest attack is that of the greatest mean SSIM among those "
+    "with a signal; of equal ones, that of the greater identified. The best values of ranked defenses are bold. A defense is "
+    "unranked and comes last if no attacker was adapted to it, if an attack has not completed all samples, or if no attack has a "
+    "signal: the benchmark cannot say how private it is."
 )
 
 
@@ -101,7 +113,8 @@ _GUARANTEES = {
 
 def _list_signal_remarks(group: ComparisonGroup) -> list[str]:
     """Return the remarks on signals, chance and baselines that are missing."""
-    chance_remark = [chance.REMARK] if any(measure.name == chance.IDENTIFIED for measure in group.measures) else []
+    metrics = [measure.name for measure in group.measures if measure.name in chance.IDENTIFICATION]
+    chance_remark = [chance.explain_identification(metric) for metric in metrics]
     untested = signal.explain_untested(list(group.signals.values()))
     return [signal.REMARK, *chance_remark, *([untested] if untested else [])]
 
@@ -210,9 +223,17 @@ def _format_value(name: str, value: Value, count: int | None) -> str:
     if name == "log10_true" and isinstance(value, float):
         return format_chance(value)
     if isinstance(value, Interval):
-        ends = f" [{format_number(value.low)}, {format_number(value.high)}]" if math.isfinite(value.low) else ""
-        return format_number(value.mean) + ends + (f" (n = {value.count})" if value.count != count else "")
+        if name.startswith(RANK_1_COLUMNS):
+            return format_fraction(value)
+        return format_interval(value) + (f" (n = {value.count})" if value.count != count else "")
     return format_number(value) if isinstance(value, float) else str(value)
+
+
+def _get_mean(group: ComparisonGroup, experiment: GroupedExperiment) -> float:
+    """Return the mean reciprocal rank of an experiment; 0 if it has none."""
+    (identified,) = list_measures([chance.IDENTIFIED])
+    average = group.average(experiment, identified)
+    return average.mean if average else 0.0
 
 
 def _list_notes(group: ComparisonGroup, experiment: GroupedExperiment, standing: Standing | None) -> Iterator[str]:
@@ -220,6 +241,10 @@ def _list_notes(group: ComparisonGroup, experiment: GroupedExperiment, standing:
     unranked_reason = standing.unranked_reason if standing else None
     if unranked_reason:
         yield f"unranked: {unranked_reason}"
+    if standing and standing.identifying and experiment is standing.strongest and standing.identifying is not experiment:
+        assert standing.identification is not None
+        if standing.identification.mean > _get_mean(group, experiment):
+            yield f"ranked by {format_number(standing.identification.mean)} identified by {standing.identifying.attack}"
     if experiment.reason:
         if experiment.reason != unranked_reason:
             yield experiment.reason

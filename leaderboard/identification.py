@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.stats import chi2
 
+from bench.core.errors import UserError
 from leaderboard.chance import PHOTOGRAPHS, RECIPROCAL_RANK
 from leaderboard.intervals import LEVEL, Interval, interval, proportion
 
@@ -58,7 +59,9 @@ def summarize_identification(reciprocals: ArrayLike) -> Identification:
     Raises
     ------
     ValueError
-        if there is no value, or a value is no reciprocal rank among 256.
+        if there is no value.
+    UserError
+        if a value is no reciprocal rank among 256.
     """
     values = _validate(reciprocals)
     return Identification(
@@ -72,29 +75,34 @@ def summarize_identification(reciprocals: ArrayLike) -> Identification:
 def measure_bits(reciprocals: ArrayLike) -> Interval:
     """Return the bits that reconstructions give about the photograph among 256, with an interval of at least 95%.
 
-    Constant images gain 0 bits, and their number counts as given.
+    Constant images gain 0 bits, and their number counts as given. Values of shape (n, s) are those of s seeds for each
+    photograph. The likelihood of a photograph is then the geometric mean over its seeds, so that n photographs count as n.
 
     Raises
     ------
     ValueError
-        if there is no value, or a value is no reciprocal rank among 256.
+        if there is no value.
+    UserError
+        if a value is no reciprocal rank among 256.
     """
-    values = _validate(reciprocals)
+    table = np.asarray(reciprocals, dtype=np.float64)
+    photographs, seeds = len(table), table.shape[1] if table.ndim == 2 else 1
+    values = _validate(table.ravel() if table.ndim == 2 else table)
     ranks = 1 / values[~_is_tied(values)]
     if len(ranks) == 0:
-        return Interval(0.0, 0.0, 0.0, len(values))
+        return Interval(0.0, 0.0, 0.0, photographs)
     unique, counts = np.unique(ranks, return_counts=True)
-    likelihood = np.log2(_evaluate_codes(unique)) @ counts  # (codes,), of all ranks
+    likelihood = np.log2(_evaluate_codes(unique)) @ (counts / seeds)  # (codes,), of all ranks
     region = likelihood.max() - likelihood <= chi2.ppf(LEVEL, PARAMETERS) / (2 * math.log(2))
     expected = _measure_expected_gains()[region]
-    gain = max(0.0, TOTAL + float(likelihood.max()) / len(ranks))  # without rounding errors
+    gain = max(0.0, TOTAL + float(likelihood.max()) * seeds / len(ranks))  # without rounding errors
     fraction = len(ranks) / len(values)
     low, high = min(gain, float(expected.min())), max(gain, float(expected.max()))
-    return Interval(fraction * gain, fraction * low, fraction * high, len(values))
+    return Interval(fraction * gain, fraction * low, fraction * high, photographs)
 
 
 def measure_reciprocal(reciprocals: ArrayLike) -> Interval:
-    """Return the mean reciprocal rank, with Student's interval within the range of the metric.
+    """Return the mean reciprocal rank, with Student's interval within the range of the metric. It is infinite for one value.
 
     A constant image counts as its expectation if its tie is broken at random. The reciprocal of its mean rank is less than that
     of a random order on average, so that random images would seem better than constant ones.
@@ -102,11 +110,28 @@ def measure_reciprocal(reciprocals: ArrayLike) -> Interval:
     Raises
     ------
     ValueError
-        if there is no value, or a value is no reciprocal rank among 256.
+        if there is no value.
+    UserError
+        if a value is no reciprocal rank among 256.
+    """
+    mean = interval(replace_ties(reciprocals))
+    if math.isinf(mean.low):
+        return mean
+    return Interval(mean.mean, max(1 / PHOTOGRAPHS, mean.low), min(1.0, mean.high), mean.count)
+
+
+def replace_ties(reciprocals: ArrayLike) -> Doubles:
+    """Return (n,) reciprocal ranks, where those of constant images are the mean of a random order.
+
+    Raises
+    ------
+    ValueError
+        if there is no value.
+    UserError
+        if a value is no reciprocal rank among 256.
     """
     values = _validate(reciprocals)
-    mean = interval(np.where(_is_tied(values), RECIPROCAL_RANK, values))
-    return Interval(mean.mean, max(1 / PHOTOGRAPHS, mean.low), min(1.0, mean.high), mean.count)
+    return np.where(_is_tied(values), RECIPROCAL_RANK, values)
 
 
 def _evaluate_codes(ranks: Doubles) -> Doubles:
@@ -136,6 +161,9 @@ def _validate(reciprocals: ArrayLike) -> Doubles:
     values = np.asarray(reciprocals, dtype=np.float64)
     if values.ndim != 1 or len(values) == 0:
         raise ValueError(f"expected (n,) reciprocal ranks, n at least 1, got {values.shape}")
-    if not ((values >= (1 - 1e-12) / PHOTOGRAPHS) & (values <= 1)).all():  # NaN is refused too
-        raise ValueError(f"reciprocal ranks among {PHOTOGRAPHS} must be from 1/{PHOTOGRAPHS} to 1")
+    wrong = values[~((values >= (1 - 1e-12) / PHOTOGRAPHS) & (values <= 1))]  # NaN too
+    if len(wrong):
+        raise UserError(
+            f"a record has the reciprocal rank {wrong[0]:g}; reciprocal ranks are from 1/{PHOTOGRAPHS} to 1: run it anew"
+        )
     return values

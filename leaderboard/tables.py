@@ -13,7 +13,15 @@ from bench.core.table import NOT_APPLICABLE, Column, Row, Table
 from bench.mechanisms.composition import DELTA, UNCOVERED
 from bench.registry import discovery
 from bench.runner.records import Record, keep_latest
-from leaderboard.chance import IDENTIFIED, REMARK, label_identified
+from leaderboard.chance import (
+    IDENTIFICATION,
+    explain_identification,
+    label_bits,
+    label_identified,
+    label_rank_1,
+    name_bits,
+    name_rank_1,
+)
 
 if TYPE_CHECKING:
     from leaderboard.intervals import Interval
@@ -21,9 +29,9 @@ if TYPE_CHECKING:
 
 Configuration = dict[str, Any] | None
 
-# The metrics that come first, in this order. The others follow by name.
 PAPER_METRICS = ("mae", "mse", "ssim", "psnr")
-FIRST_METRICS = ("keypoints", *PAPER_METRICS)
+# The metrics that come first, in this order. The others follow by name. Those that rank defenses are side by side.
+FIRST_METRICS = ("keypoints", "mae", "mse", "ssim", *IDENTIFICATION, "psnr")
 FRACTION_PREFIX = "recall_"  # of metrics that are 1 or 0 for each sample
 MEDIAN_METRICS = ("translation_error", "rotation_error")  # over all samples; one without a value was not localized: the worst
 SEED_REMARK = "Releases are seeded: they are for measuring, and not private."
@@ -40,9 +48,11 @@ def build_tables(records: Iterable[Record], *, brief: bool = False, foldable: bo
     """Return a table of the latest records for each task, dataset (with its extractor), seed and condition.
 
     A row has the mean of each metric over the photographs that have it, or the median over all photographs for `MEDIAN_METRICS`.
-    Fractions have Wilson's interval. Values that do not apply are missing, and a note gives the reason.
+    Fractions have Wilson's interval. A metric of identification also has the fraction of photographs of rank 1, and bits. Values
+    that do not apply are missing, and a note gives the reason.
 
-    A `brief` table is for a terminal: it lacks `FILE_ONLY_COLUMNS` and has numbered notes. In a `foldable` table, the labels have
+    A `brief` table is for a terminal: it lacks `FILE_ONLY_COLUMNS`, has numbered notes, and has the three values of a metric of
+    identification in one column. In a `foldable` table, the labels have
     line breaks between fields, so they cannot be copied into a command.
     """
     groups = _group_by(
@@ -101,7 +111,10 @@ def _build_table(records: list[Record], brief: bool, foldable: bool) -> Table:
     columns = {"defense": "defense", "attack": "attack", "photographs": "n"}
     if any(row["failed"] for row in rows):
         columns["failed"] = "failed"
-    columns |= {name: _label_metric(name) for name in metrics}
+    for name in metrics:
+        columns[name] = _label_metric(name)
+        if name in IDENTIFICATION and not brief:
+            columns |= {name_rank_1(name): label_rank_1(name), name_bits(name): label_bits(name)}
     columns |= {"epsilon_descriptor": "ε/descriptor", "epsilon_image": "ε/image", "log10_true": "Pr(true)"}
     if brief:
         columns = {name: label for name, label in columns.items() if label not in FILE_ONLY_COLUMNS}
@@ -109,14 +122,19 @@ def _build_table(records: list[Record], brief: bool, foldable: bool) -> Table:
         columns["note"] = "note"
     heading = _describe_samples(records)
     failures = _list_failures(experiments, labels)
-    chance = [REMARK] if IDENTIFIED in metrics else []
+    chance = [explain_identification(name) for name in metrics if name in IDENTIFICATION]
     remarks = [*_list_signal_remarks(signals), COMPOSITION_REMARK, SEED_REMARK]
     return Table(
         heading=heading,
         columns=tuple(Column(label=label, text=name in ("defense", "attack", "note")) for name, label in columns.items()),
         rows=tuple(
             Row(
-                texts=tuple(_format_value(name, row[name], foldable) for name in columns),
+                texts=tuple(
+                    _format_identification(name, row)
+                    if brief and name in IDENTIFICATION
+                    else _format_value(name, row[name], foldable)
+                    for name in columns
+                ),
                 values=row | {"heading": heading},
                 note=row["note"] if brief else "",
             )
@@ -168,10 +186,7 @@ def _collect_values(
         "attack": labels[1],
         "photographs": len(completed) if applies else None,
         "failed": len(records) - len(completed) if applies else None,
-        **{
-            name: _average(name, [record["metrics"][name] for record in completed if name in record["metrics"]])
-            for name in metrics
-        },
+        **_average_metrics(completed, metrics),
         "epsilon_descriptor": _to_float(privacy["epsilon_descriptor"]),
         "epsilon_image": _median(spent_epsilon(record["privacy"]) for record in completed),
         "log10_true": _to_float(privacy["log10_true"]),
@@ -189,21 +204,29 @@ def _format_value(name: str, value: Any, foldable: bool) -> str:
         return format_chance(value)
     if isinstance(value, float):
         return format_number(value)
-    return f"{format_number(value.mean)} [{format_number(value.low)}, {format_number(value.high)}]"
+    return format_fraction(value) if name in map(name_rank_1, IDENTIFICATION) else format_interval(value)
+
+
+def _format_identification(name: str, row: Mapping[str, Any]) -> str:
+    """Return the three values of a metric of identification, for a column of a terminal."""
+    if row[name] is None:
+        return NOT_APPLICABLE
+    bits: Interval = row[name_bits(name)]
+    return f"{row[name]:.2f}, {count_hits(row[name_rank_1(name)])}\n{bits.mean:.1f} bits [{bits.low:.1f}, {bits.high:.1f}]"
 
 
 def _label_metric(name: str) -> str:
     if name in PAPER_METRICS:
         return name.upper()
-    if name == IDENTIFIED:
-        return label_identified()
+    if name in IDENTIFICATION:
+        return label_identified(name)
     return f"median {name}" if name in MEDIAN_METRICS else name
 
 
 def _explain_metrics(metrics: Sequence[str]) -> list[str]:
-    """Return the descriptions of all metrics but `identified`, which `REMARK` explains."""
+    """Return the descriptions of all metrics but those of identification, which have a remark."""
     plugins = {plugin.name(): plugin for plugin in discovery.load_plugins(discovery.METRIC)}
-    return [f"{name}: {plugins[name].description()}" for name in metrics if name in plugins and name != IDENTIFIED]
+    return [f"{name}: {plugins[name].description()}" for name in metrics if name in plugins and name not in IDENTIFICATION]
 
 
 def _list_notes(records: list[Record], completed: list[Record], signal: Signal | None) -> list[str]:
@@ -292,6 +315,26 @@ def _median(values: Iterable[float | None]) -> float | None:
     return float(np.median(known)) if known else None
 
 
+def _average_metrics(completed: Sequence[Record], metrics: Sequence[str]) -> dict[str, float | Interval | None]:
+    """Return the averages of all metrics over the samples that have them, by name; those of identification have three."""
+    averages: dict[str, float | Interval | None] = {}
+    for name in metrics:
+        values = [record["metrics"][name] for record in completed if name in record["metrics"]]
+        averages |= _summarize_ranks(name, values) if name in IDENTIFICATION else {name: _average(name, values)}
+    return averages
+
+
+def _summarize_ranks(name: str, values: Sequence[float | None]) -> dict[str, float | Interval | None]:
+    """Return the mean reciprocal rank, the fraction of rank 1, and the bits."""
+    from leaderboard.identification import summarize_identification  # expensive: imports scipy
+
+    known = [float(value) for value in values if value is not None]
+    if not known:
+        return {name: None, name_rank_1(name): None, name_bits(name): None}
+    summary = summarize_identification(known)
+    return {name: summary.reciprocal.mean, name_rank_1(name): summary.rank_1, name_bits(name): summary.bits}
+
+
 def _average(name: str, values: list[float | None]) -> float | Interval | None:
     """Return the average of a metric over the samples. A fraction of samples comes with its interval."""
     from leaderboard.intervals import proportion  # expensive: imports scipy
@@ -309,6 +352,27 @@ def format_number(value: float) -> str:
     if math.isnan(value) or math.isinf(value):
         return NOT_APPLICABLE if math.isnan(value) else "∞"
     return f"{value:.0f}" if MOST_DIGITS <= abs(value) < LARGE else f"{value:.4g}"
+
+
+def format_interval(value: Interval) -> str:
+    """Return a mean with its interval; a mean alone if the interval is infinite."""
+    ends = f" [{format_number(value.low)}, {format_number(value.high)}]" if math.isfinite(value.low) else ""
+    return format_number(value.mean) + ends
+
+
+def format_fraction(value: Interval) -> str:
+    """Return a fraction with its interval and the number of hits.
+
+    >>> from leaderboard.intervals import proportion
+    >>> format_fraction(proportion([1, 0, 0, 1]))
+    '0.5 [0.15, 0.85] (2 of 4)'
+    """
+    return f"{format_interval(value)} ({count_hits(value)})"
+
+
+def count_hits(value: Interval) -> str:
+    """Return the number of hits of a fraction, such as "2 of 4". As a mean over seeds, it need not be an integer."""
+    return f"{format_number(round(value.mean * value.count, 1))} of {value.count}"
 
 
 def format_chance(log10: float) -> str:

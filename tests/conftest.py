@@ -5,8 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fakes import write_album
 
 from bench.cache import store
+from bench.codebook.examples import write_dictionary
+from bench.settings import Asset
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 
@@ -22,6 +25,18 @@ def _cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 @pytest.fixture
 def rng() -> np.random.Generator:
     return np.random.default_rng(20231002)
+
+
+@pytest.fixture
+def images(tmp_path: Path) -> Path:
+    """Two small photographs."""
+    return write_album(tmp_path / "album")
+
+
+@pytest.fixture
+def small(tmp_path: Path) -> Asset:
+    """A dictionary of few words."""
+    return write_dictionary(tmp_path)
 
 
 @pytest.fixture(scope="session")

@@ -43,11 +43,7 @@ def _average_weights(length: int) -> Doubles:
 
 def normalize_thumbnails(thumbnails: Doubles) -> Doubles:
     """Subtract the mean of each thumbnail and scale it to unit norm; a constant one becomes zero. (..., 16, 16) -> (..., 256)"""
-    rows = thumbnails.reshape(*thumbnails.shape[:-2], SIDE * SIDE)
-    centred = rows - rows.mean(axis=-1, keepdims=True)
-    norms = np.linalg.norm(centred, axis=-1, keepdims=True)
-    smallest = CONSTANT * SIDE  # the norm is the standard deviation times the root of 16 x 16
-    return np.where(norms > smallest, centred / np.maximum(norms, smallest), 0.0)
+    return _normalize(_flatten(thumbnails))
 
 
 def compare_thumbnails(one: Doubles, other: Doubles) -> Doubles:
@@ -67,3 +63,39 @@ def rank_first(similarities: Doubles) -> float:
     128.5
     """
     return float(1 + (similarities[1:] > similarities[0]).sum() + (similarities[1:] == similarities[0]).sum() / 2)
+
+
+def compare_shifted(one: Doubles, other: Doubles, shift: int) -> Doubles:
+    """Return the greatest correlation of thumbnails over shifts of up to `shift` rows and columns, from -1 to 1.
+
+    Each correlation is that of the parts which overlap. (16, 16), (N, 16, 16) -> (N,)
+    """
+    best = np.full(len(other), -1.0)
+    for down in range(-shift, shift + 1):
+        for right in range(-shift, shift + 1):
+            rows, columns = _slice_overlap(down), _slice_overlap(right)
+            parts = one[rows[0], columns[0]], other[:, rows[1], columns[1]]
+            best = np.maximum(best, _correlate(*(_flatten(part) for part in parts)))
+    return best
+
+
+def _slice_overlap(shift: int) -> tuple[slice, slice]:
+    """Return the rows of one thumbnail, and those of the other, that coincide after a shift."""
+    return slice(max(0, shift), SIDE + min(0, shift)), slice(max(0, -shift), SIDE + min(0, -shift))
+
+
+def _flatten(part: Doubles) -> Doubles:
+    return part.reshape(*part.shape[:-2], -1)
+
+
+def _correlate(one: Doubles, other: Doubles) -> Doubles:
+    """Return the normalised correlation; 0 for a constant part. (P,), (N, P) -> (N,)"""
+    return np.asarray(_normalize(other) @ _normalize(one))
+
+
+def _normalize(rows: Doubles) -> Doubles:
+    """Subtract the mean of each row and scale it to unit norm; a constant one becomes zero. (..., P) -> (..., P)"""
+    centred = rows - rows.mean(axis=-1, keepdims=True)
+    norms = np.linalg.norm(centred, axis=-1, keepdims=True)
+    smallest = CONSTANT * rows.shape[-1] ** 0.5  # the norm is the standard deviation times the root of P
+    return np.where(norms > smallest, centred / np.maximum(norms, smallest), 0.0)

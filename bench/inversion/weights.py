@@ -177,6 +177,8 @@ def explain_incompatible(meta: dict[str, Any], defense: Defense, extractor: Extr
 
 def explain_other_features(meta: dict[str, Any], extractor: Extractor, public: Public) -> str | None:
     """Return the reason why a network does not suit the features of `extractor`; None if it was trained for them."""
+    if meta["extractor"]["name"] != extractor.name():  # their fields have little in common
+        return f"trained for features of {meta['extractor']['name']}, not {extractor.name()}"
     features = spec.to_json_with_digests(extractor, public)
     for field in sorted(meta["extractor"].keys() | features.keys()):
         if meta["extractor"].get(field) != features.get(field):

@@ -124,6 +124,8 @@ def build_plan(configuration: RunConfiguration, describe: Describe = environment
         "extractor": spec.to_json_with_digests(extractor, public),
     }
     metrics = (*_default_metrics(), *configuration.metrics) if task.judges_attacks else ()
+    if collection.scene is None:
+        metrics = tuple(metric for metric in metrics if metric.compares != "views")
     metric_settings = {metric.name(): _settings(metric) for metric in metrics}
     plugins = [plugin for pair in configuration.pairs for plugin in pair if plugin is not None]
     environment_record = dict(describe([task, extractor, *plugins, *metrics]))

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from bench import scene_views
 from bench.api import Attack, Dataset, Defense, Extractor, ImageAttack, LocalMetric, Metric, Selection, View
 from bench.cache import attack_cache
 from bench.codebook.public import Public
@@ -169,6 +170,9 @@ def compute_metrics(trial: Trial, selection: Selection | None, image: Floats | N
     for metric in trial.metrics:
         if metric.compares == "images":
             values[metric.name()] = None if image is None else _compute_metric(metric, truth, image)
+        elif metric.compares == "views":
+            views = None if image is None else list_views(trial)
+            values[metric.name()] = None if image is None or views is None else _compute_metric(metric, views, image)
         else:
             values[metric.name()] = (
                 None
@@ -178,6 +182,12 @@ def compute_metrics(trial: Trial, selection: Selection | None, image: Floats | N
     if image is not None and (mask := trial.images[0].foreground()) is not None:
         values |= compute_part_metrics(trial.metrics, truth, image, mask)
     return Outcome(metrics=values, image=image, notes=notes)
+
+
+def list_views(trial: Trial) -> Floats | None:
+    """Return another view of the sample's scene and 255 views of others, (256, 16, 16); None if the sample has no scene."""
+    index = trial.public.scene_index
+    return None if index is None else scene_views.list_candidates(trial.sample.subject, index.scene.references)
 
 
 def compute_part_metrics(metrics: Sequence[Metric], truth: Floats, image: Floats, mask: Mask) -> dict[str, float | None]:

@@ -18,7 +18,7 @@ from leaderboard.reproduce import run
 from leaderboard.reproduce.claims import ClaimResult, Evidence, Verdict
 from leaderboard.reproduce.run import ReproducedTable
 from leaderboard.reproduce.study import Row
-from leaderboard.tables import SEED_REMARK, label_extractor
+from leaderboard.tables import SEED_REMARK, count_hits, label_extractor
 
 if TYPE_CHECKING:
     from rich.table import Table as RichTable
@@ -181,8 +181,8 @@ def list_remarks(table: ReproducedTable) -> list[str]:
     if table.signals:
         untested = signal.explain_untested(list(table.signals.values()))
         lines += [signal.REMARK, *([untested] if untested else [])]
-    if any(measure.metric == chance.IDENTIFIED for measure in definition.measures.values()):
-        lines.append(chance.REMARK)
+    metrics = dict.fromkeys(measure.metric for measure in definition.measures.values())
+    lines += [chance.explain_identification(metric) for metric in metrics if metric in chance.IDENTIFICATION]
     return [*lines, *definition.notes, INTERVALS, SEED_REMARK]
 
 
@@ -224,9 +224,9 @@ def _format_row(row: Row, table: ReproducedTable, printed: Container[str]) -> di
         ours = table.ours.get((row.name, name))
         if name in row.paper:
             columns[f"{name}, paper"] = f"{row.paper[name]:.{measure.digits}f}"
-        columns[f"{name}, ours" if name in printed else name] = (
-            "n/a" if ours is None else _format_interval(ours, measure.digits, "f")
-        )
+        text = "n/a" if ours is None else _format_interval(ours, measure.digits, "f")
+        hits = f" ({count_hits(ours)})" if ours and measure.identification == "rank 1" else ""
+        columns[f"{name}, ours" if name in printed else name] = text + hits
         counts |= set() if ours is None else {ours.count}
     return columns | {"n": "/".join(map(str, sorted(counts))) or "0"}
 

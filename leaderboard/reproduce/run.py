@@ -20,6 +20,8 @@ from bench.runner.plan import Plan, RunConfiguration, build_plan
 from bench.runner.records import Record
 from bench.runner.trial import dry_run
 from bench.task_api import Task
+from leaderboard.chance import IDENTIFICATION
+from leaderboard.identification import measure_bits, measure_reciprocal
 from leaderboard.intervals import Interval, interval, proportion, rank_correlation
 from leaderboard.reproduce import study
 from leaderboard.reproduce.claims import ClaimResult, TableEntry, judge_claims
@@ -213,6 +215,12 @@ def _get_value(measure: Measure, record: Record) -> float | None:
 def _compute_interval(measure: Measure, column: pd.Series) -> Interval:
     if measure.median:
         return Interval(float(column.median()), -math.inf, math.inf, len(column))
+    if measure.identification == "bits":
+        return measure_bits(column)
+    if measure.identification == "rank 1":
+        return proportion(column == 1)
+    if measure.metric in IDENTIFICATION:
+        return measure_reciprocal(column)
     return proportion(column / measure.factor, measure.factor) if measure.fraction else interval(column)
 
 

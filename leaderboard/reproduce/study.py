@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from bench.api import Attack, Dataset, Defense, Extractor, Plugin
 from bench.extractors.sift import Sift
@@ -13,6 +13,7 @@ from bench.registry.discovery import Kind
 from bench.settings import Asset
 from bench.task_api import Task
 from bench.tasks.reconstruction import Reconstruction
+from leaderboard.chance import IDENTIFIED, label_bits, label_identified, label_rank_1
 from leaderboard.reproduce.claims import Claim, TableEntry
 from leaderboard.reproduce.profiles import Profile, Setting
 from leaderboard.signal import BASELINES
@@ -47,6 +48,8 @@ class Measure:
     condition: str | None = None  # only samples with this condition count; None: all
     fraction: bool = False  # each sample's value is 0 or 1, and the mean is a fraction
     median: bool = False  # median over samples instead of the mean; a sample without a value counts as the worst
+    # of a metric of identification, instead of the mean: the fraction of samples of rank 1, or the bits
+    identification: Literal["rank 1", "bits"] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,6 +69,15 @@ class Table:
     build_reference_rows: Callable[[Setting], tuple[Row, ...]] = field(default=lambda setting: ())
     draw: Callable[[FigureData], Iterator[tuple[str, Figure]]] | None = None  # yields its figures, as `Drawing.draw` does
     notes: tuple[str, ...] = ()
+
+
+def build_identification_measures() -> dict[str, Measure]:
+    """Return the columns of `identified`: the mean reciprocal rank, the fraction of rank 1, and the bits."""
+    return {
+        label_identified(): Measure(metric=IDENTIFIED, digits=3),
+        label_rank_1(): Measure(metric=IDENTIFIED, digits=2, identification="rank 1"),
+        label_bits(): Measure(metric=IDENTIFIED, digits=1, identification="bits"),
+    }
 
 
 def collect_paper_values(rows: tuple[Row, ...]) -> dict[TableEntry, float]:

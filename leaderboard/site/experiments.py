@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 
 from bench.mechanisms.composition import DELTA
 from bench.runner.records import Record
+from leaderboard.chance import IDENTIFICATION, name_bits, name_rank_1
 from leaderboard.comparison import ComparisonGroup, GroupedExperiment
 from leaderboard.group_tables import GroupColumn, GroupRow, GroupTable, Value, comparable_number, describe_guarantee
 from leaderboard.intervals import Interval
@@ -18,7 +20,7 @@ from leaderboard.measures import PRIVACY
 from leaderboard.recipe import Lookup, Recipe, build_recipe
 from leaderboard.site import pictures
 from leaderboard.site.pictures import Pair
-from leaderboard.tables import FILE_ONLY_COLUMNS, add_breaks, format_number
+from leaderboard.tables import FILE_ONLY_COLUMNS, add_breaks, count_hits, format_number
 from leaderboard.tradeoff import Tradeoff
 
 HIDDEN_COLUMNS = ("log10_true", *(name.lower() for name in FILE_ONLY_COLUMNS))  # the page's table has no room for them
@@ -41,6 +43,7 @@ class View:
     row: GroupRow
     label: tuple[str, str]  # the defense's name, and its settings
     texts: dict[str, tuple[str, str]]  # column -> the number and its interval
+    details: dict[str, tuple[tuple[str, str], ...]]  # column -> texts of other columns that it shows, such as bits
     values: dict[str, str]  # column -> its sort key; "" where there is no value
     best: frozenset[str]  # columns in which it is the best
     pictures: tuple[Picture, ...]
@@ -61,9 +64,21 @@ class View:
 
 
 def select_columns(table: GroupTable) -> list[GroupColumn]:
-    """Return the columns of the page's table: the judged measures, and what identifies a row."""
+    """Return the columns of the page's table: the judged measures, and what identifies a row.
+
+    The column of a metric of identification also shows its rank 1 and its bits.
+    """
     names = ("rank", "defense", "guarantee", "epsilon_descriptor", "epsilon_image", "attack", "signal", "units")
-    return [column for column in table.columns if column.name in names or (column.better and column.name not in HIDDEN_COLUMNS)]
+    hidden = {*HIDDEN_COLUMNS, *(name for column in table.columns for name in _list_details(column.name))}
+    return [column for column in table.columns if column.name in names or (column.better and column.name not in hidden)]
+
+
+def _list_details(column: str) -> tuple[str, ...]:
+    """Return the columns of rank 1 and of bits that belong to the column of a metric of identification."""
+    metric, separator, condition = column.partition("_")
+    if metric not in IDENTIFICATION or (separator and condition.startswith(("rank_1", "bits"))):
+        return ()
+    return tuple(f"{name(metric)}{separator}{condition}" for name in (name_rank_1, name_bits))
 
 
 def build_view(
@@ -79,6 +94,7 @@ def build_view(
         row=row,
         label=(name, add_breaks(fields)),
         texts=texts | {"attack": (add_breaks(experiment.attack), "")},
+        details={column.name: tuple(_list_detail_texts(column.name, row.values)) for column in table.columns},
         values={column.name: _sort_key(row.values[column.name]) for column in table.columns},
         best=frozenset(table.columns[index].name for index in row.best),
         pictures=tuple(_list_pictures(group, experiment, out)),
@@ -89,6 +105,19 @@ def build_view(
         failures=tuple(_list_failures(experiment)),
         utilities=tuple(_list_utilities(experiment, tradeoffs)),
     )
+
+
+def _list_detail_texts(column: str, values: Mapping[str, Value]) -> Iterator[tuple[str, str]]:
+    """Yield rank 1 as "1 of 7" and the bits, each with its interval."""
+    rank_1, bits = map(values.get, _list_details(column) or (column, column))
+    if isinstance(rank_1, Interval) and isinstance(bits, Interval) and rank_1 is not bits:
+        yield count_hits(rank_1), _format_ends(rank_1, 2)
+        yield f"{bits.mean:.1f} bits", _format_ends(bits, 1)
+
+
+def _format_ends(value: Interval, digits: int) -> str:
+    """Return the interval; "" if it is infinite, as for the mean of one sample over seeds."""
+    return f"[{value.low:.{digits}f},\N{NO-BREAK SPACE}{value.high:.{digits}f}]" if math.isfinite(value.low) else ""
 
 
 def label_sample(group: ComparisonGroup, record: Record) -> str:

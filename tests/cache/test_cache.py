@@ -15,7 +15,7 @@ import platformdirs
 import pytest
 from fake_plugins.guess import Guess
 from fake_plugins.sketch import Sketch
-from fakes import FAKES, install_plugins, prepare_plan, write_album
+from fakes import FAKES, install_plugins, prepare_plan
 
 from attacks.sparsity import Sparsity
 from bench import cli
@@ -46,16 +46,6 @@ def cache_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv(store.VARIABLE, str(tmp_path / "cache"))
     monkeypatch.setattr(attack_cache, "MIN_SECONDS", 0.0)
     return tmp_path / "cache"
-
-
-@pytest.fixture
-def images(tmp_path: Path) -> Path:
-    return write_album(tmp_path / "album")
-
-
-@pytest.fixture
-def small(tmp_path: Path) -> Asset:
-    return write_dictionary(tmp_path)
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from fake_plugins.sketch import Sketch
-from fakes import FAKES, install_plugins, write_album
+from fakes import FAKES, install_plugins
 
 from bench import cli
 from bench.api import View
@@ -40,11 +40,6 @@ def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.Capture
         return status, out, err
 
     return run
-
-
-@pytest.fixture
-def images(tmp_path: Path) -> Path:
-    return write_album(tmp_path / "album")
 
 
 @pytest.mark.slow

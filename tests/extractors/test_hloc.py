@@ -9,8 +9,11 @@ import pytest
 from fakes import draw_texture
 from PIL import Image
 
+from attacks.dia import DIA
+from attacks.keypoints import Keypoints
 from attacks.lattice import Lattice
 from attacks.sparsity import Sparsity
+from bench.api import Attack
 from bench.codebook.public import Public
 from bench.core.errors import SampleError, UserError
 from bench.extractors.hloc import Hloc
@@ -19,6 +22,7 @@ from bench.images import photographs
 from bench.images.views import extract_views
 from bench.testing import check_extractor
 from defenses.affine import Affine
+from defenses.none import Undefended
 
 WIDTH, HEIGHT = 400, 200
 KEYPOINTS = np.array([[100.0, 0.0], [299.0, 199.0], [199.5, 99.5], [10.0, 10.0], [390.0, 10.0]])
@@ -67,6 +71,14 @@ def test_declared_properties_of_descriptors_decide_which_attacks_apply(tmp_path:
     for attack, declared in ((Sparsity(), {"exact_zeros": True}), (Lattice(), {"eight_bit": True})):
         assert "hloc does not declare" in (attack.explain_not_applicable(Affine(), Hloc(path=path), Public()) or "")
         assert attack.explain_not_applicable(Affine(), Hloc(path=path, **declared), Public()) is None
+
+
+@pytest.mark.parametrize("attack", [DIA(), Keypoints()], ids=lambda attack: attack.name())
+def test_a_network_for_other_features_names_both_extractors(attack: Attack, tmp_path: Path) -> None:
+    reason = attack.explain_not_applicable(Undefended(), Hloc(path=features(tmp_path)), Public())
+    assert reason is not None
+    assert "trained for features of sift, not hloc" in reason
+    assert "None" not in reason
 
 
 def test_keypoints_follow_crop_and_scale(tmp_path: Path, photograph: Path) -> None:

@@ -84,7 +84,7 @@ def test_each_seed_has_a_group_and_their_mean_has_one(tmp_path: Path) -> None:
     assert [group.seeds for group in (averaged, first, second)] == [(1, 2), (1,), (2,)]
     assert [len(group.experiments) for group in (averaged, first, second)] == [1, 1, 2]  # ldp lacks a seed, and is not averaged
     (ssim,) = list_measures(["ssim"])
-    assert averaged.list_values(averaged.experiments[0], "ssim") == [pytest.approx(0.4), pytest.approx(0.6)]
+    assert averaged.list_values(averaged.experiments[0], ssim) == [pytest.approx(0.4), pytest.approx(0.6)]
     interval = averaged.average(averaged.experiments[0], ssim)
     assert interval is not None
     assert interval.count == 2  # photographs, not photographs times seeds
@@ -94,7 +94,7 @@ def test_each_seed_has_a_group_and_their_mean_has_one(tmp_path: Path) -> None:
 def test_a_sample_that_one_seed_lacks_is_not_averaged(tmp_path: Path) -> None:
     other = reconstructions(ldp(8.0), [0.3, 0.5], seed=1), reconstructions(ldp(8.0), [0.3, 0.5], seed=2)
     averaged, *_ = build(tmp_path, reconstructions(NONE, [0.5, 0.9], seed=1), reconstructions(NONE, [0.3], seed=2), *other)
-    assert averaged.list_values(averaged.experiments[0], "ssim") == [pytest.approx(0.4)]
+    assert averaged.list_values(averaged.experiments[0], *list_measures(["ssim"])) == [pytest.approx(0.4)]
     assert averaged.count_missing(averaged.experiments[0]) == 1
     assert by_defense(averaged)["none"].unranked_reason == "dia has completed 1 of 2 samples"
 
@@ -142,6 +142,56 @@ def test_equal_scores_share_a_rank(tmp_path: Path) -> None:
     scores = ((1.0, 0.3), (2.0, 0.3), (3.0, 0.4))
     (group,) = build(tmp_path, *(reconstructions(ldp(eps), [score] * 6) for eps, score in scores), baselines(ldp(1.0), 6))
     assert [one.rank for one in rank_defenses(group)] == [1, 1, 3]
+
+
+def identify(records: list[dict[str, Any]], reciprocals: list[float]) -> list[dict[str, Any]]:
+    """Return the records with these values of `identified`."""
+    for one, value in zip(records, reciprocals, strict=True):
+        one["metrics"]["identified"] = value
+    return records
+
+
+def rank_by_both(folder: Path, scores: dict[float, tuple[float, float]], *others: list[dict[str, Any]]) -> ComparisonGroup:
+    """Return a group of LDP at each ε with a mean SSIM and a reciprocal rank, and of the baselines."""
+    parts = [
+        identify(reconstructions(ldp(epsilon), [ssim] * 6), [reciprocal] * 6) for epsilon, (ssim, reciprocal) in scores.items()
+    ]
+    (group,) = build(folder, *parts, identify(baselines(ldp(1.0), 6), [1 / 128.5] * 12), *others)
+    return group
+
+
+def list_ranks(group: ComparisonGroup) -> dict[float, int | None]:
+    return {one.configuration["epsilon"]: one.rank for one in rank_defenses(group)}
+
+
+def test_identification_ranks_beside_ssim(tmp_path: Path) -> None:
+    # Positions in SSIM and in identified, equal sums: the lower identified comes first.
+    group = rank_by_both(tmp_path / "a", {1.0: (0.38, 0.5), 2.0: (0.39, 0.1), 3.0: (0.6, 1.0)})
+    assert list_ranks(group) == {2.0: 1, 1.0: 2, 3.0: 3}
+    # SSIM decides where all are identified, and equal scores share a rank.
+    group = rank_by_both(tmp_path / "b", {1.0: (0.5, 1.0), 2.0: (0.6, 1.0), 3.0: (0.6, 1.0)})
+    assert list_ranks(group) == {1.0: 1, 2.0: 2, 3.0: 2}
+    # The sum of positions decides: 0 + 2, 1 + 0, 2 + 1.
+    group = rank_by_both(tmp_path / "c", {1.0: (0.1, 0.3), 2.0: (0.2, 0.1), 3.0: (0.3, 0.2)})
+    assert list_ranks(group) == {2.0: 1, 1.0: 2, 3.0: 3}
+
+
+def test_each_score_is_of_its_own_strongest_attack(tmp_path: Path) -> None:
+    """An attack that identifies more than the one with the greatest SSIM counts, and a note names it."""
+    other = identify(reconstructions(ldp(1.0), [0.2] * 6, attack=NEAREST), [0.9] * 6)
+    scores = {1.0: (0.3, 0.2), 2.0: (0.31, 0.4)}
+    assert list_ranks(rank_by_both(tmp_path / "a", scores)) == {1.0: 1, 2.0: 2}
+    group = rank_by_both(tmp_path / "b", scores, other)
+    assert list_ranks(group) == {2.0: 1, 1.0: 2}
+    notes = {row.values["epsilon_descriptor"]: row.note for row in group_tables.build_ranking_table(group).rows}
+    assert notes == {1.0: "ranked by 0.9 identified by nearest", 2.0: ""}
+
+
+def test_an_attack_without_a_signal_identifies_nothing(tmp_path: Path) -> None:
+    """Negative control: the reciprocal rank of one lucky photograph is no evidence."""
+    other = identify(reconstructions(ldp(1.0), [0.002] * 6, attack=NEAREST), [1.0, *[1 / 200] * 5])
+    group = rank_by_both(tmp_path, {1.0: (0.3, 0.1), 2.0: (0.31, 0.12)}, other)
+    assert list_ranks(group) == {1.0: 1, 2.0: 2}
 
 
 def test_without_an_adapted_attacker_a_defense_is_unranked_and_last(tmp_path: Path) -> None:

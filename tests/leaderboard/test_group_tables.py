@@ -8,12 +8,14 @@ from pathlib import Path
 import fabricated
 import pytest
 from fabricated import DIA, baselines, inapplicable, ldp, localizations, reconstructions
+from scipy import stats
 
 from bench.core import table as core_table
 from bench.core.table import to_csv, to_latex, to_markdown
 from leaderboard import comparison
 from leaderboard.comparison import ComparisonGroup
 from leaderboard.group_tables import GroupTable, build_pairs_table, build_ranking_table
+from leaderboard.identification import measure_bits
 from leaderboard.intervals import interval
 
 NONE = {"name": "none"}
@@ -96,6 +98,42 @@ def test_a_metric_of_some_photographs_shows_their_number(tmp_path: Path) -> None
     (row,) = table.rows
     (column,) = (column for column in table.columns if column.name == "face")
     assert row.texts[table.columns.index(column)] == "0.5 [0.09453, 0.9055] (n = 2)"
+
+
+def test_identification_is_shown_in_three_columns_beside_ssim(tmp_path: Path) -> None:
+    values = [1.0, 1.0, 0.5, 1 / 40, 1 / 9, 1 / 128.5]
+    records = [*reconstructions(NONE, [0.7, 0.9] * 3), *baselines(NONE, 6)]
+    for record, value in zip(records, [*values, *[1 / 128.5] * 12], strict=True):
+        record["metrics"]["identified"] = value
+    (group,) = comparison.build_groups(comparison.load_records(fabricated.write(tmp_path, records)))
+    table = build_pairs_table(group)
+    names = [column.name for column in table.columns]
+    first = names.index("ssim")
+    assert names[first : first + 4] == ["ssim", "identified", "identified_rank_1", "identified_bits"]
+    row, blank = (table.rows[index].texts[first + 1 : first + 4] for index in (0, 1))
+    wilson = stats.binomtest(2, 6).proportion_ci(0.95, method="wilson")
+    assert row[1] == f"0.3333 [{wilson.low:.4g}, {wilson.high:.4g}] (2 of 6)"
+    bits = measure_bits(values)
+    assert row[2] == f"{bits.mean:.4g} [{bits.low:.4g}, {bits.high:.4g}]"
+    assert blank[0].startswith("0.02392 "), "a constant image has the mean of a random order"
+    assert blank[1:] == (f"0 [0, {stats.binomtest(0, 6).proportion_ci(0.95, method='wilson').high:.4g}] (0 of 6)", "0 [0, 0]")
+    for written in (to_markdown(table), to_latex(table)):
+        assert "identified, bits of 8 (chance 0)" in written
+    (line, *_) = csv.DictReader(io.StringIO(to_csv(table)))
+    assert float(line["identified_bits_high"]) == bits.high
+
+
+def test_seeds_are_averaged_before_the_photographs(tmp_path: Path) -> None:
+    records = [one for seed in (0, 1) for one in reconstructions(NONE, [0.7] * 6, seed=seed)]
+    by_seed = [[1.0] * 6, [0.5, 1.0] * 3]
+    for record, value in zip(records, [*by_seed[0], *by_seed[1]], strict=True):
+        record["metrics"]["identified"] = value
+    groups = comparison.build_groups(comparison.load_records(fabricated.write(tmp_path, records)))
+    (group,) = (group for group in groups if group.seeds == (0, 1))
+    (row,) = build_pairs_table(group).rows
+    assert row.values["identified_rank_1"] == interval([0.5, 1.0] * 3)
+    assert row.values["identified_bits"] == measure_bits(list(zip(*by_seed, strict=True)))
+    assert "(4.5 of 6)" in to_markdown(build_pairs_table(group))
 
 
 def test_latex_is_booktabs_of_even_rows(group: ComparisonGroup) -> None:

@@ -8,6 +8,7 @@ import pytest
 from scipy.optimize import minimize
 from scipy.stats import binom, binomtest, norm, sem, t
 
+from bench.core.errors import UserError
 from leaderboard.chance import PHOTOGRAPHS, RECIPROCAL_RANK
 from leaderboard.identification import (
     _evaluate_codes,
@@ -100,6 +101,16 @@ def test_order_and_copies_do_not_matter(rng: np.random.Generator) -> None:
     twice = measure_bits(np.tile(values, 2))
     assert twice.mean == pytest.approx(first.mean)
     assert twice.high - twice.low < first.high - first.low
+
+
+def test_seeds_of_a_photograph_do_not_count_as_photographs(rng: np.random.Generator) -> None:
+    values = 1 / rng.integers(1, 60, 40)
+    once = measure_bits(values)
+    assert measure_bits(np.stack([values] * 3, axis=1)) == once
+    by_seed = 1 / rng.integers(1, 60, (40, 2))
+    together, all_separate = measure_bits(by_seed), measure_bits(by_seed.ravel())
+    assert (together.mean, together.count) == (pytest.approx(all_separate.mean), 40)
+    assert together.high - together.low > all_separate.high - all_separate.low
 
 
 # ---- bias and coverage
@@ -203,5 +214,5 @@ def test_mean_reciprocal_rank_of_others_has_students_interval(rng: np.random.Gen
 
 @pytest.mark.parametrize("values", [[], [0.0], [1.1], [float("nan")], [[1.0]], [1 / 257]], ids=str)
 def test_other_values_are_refused(values: list) -> None:
-    with pytest.raises(ValueError, match="reciprocal ranks"):
+    with pytest.raises((ValueError, UserError), match="reciprocal ranks"):
         summarize_identification(values)

@@ -14,6 +14,7 @@ import pandas as pd
 import pytest
 from fakes import draw_texture
 from PIL import Image
+from scipy.stats import binomtest
 
 from bench import cli
 from bench.api import Attack, Defense
@@ -28,6 +29,8 @@ from bench.runner import suite
 from bench.runner.records import FILE, Record
 from bench.settings import Asset
 from bench.tasks.reconstruction import Reconstruction
+from leaderboard.chance import RECIPROCAL_RANK
+from leaderboard.identification import measure_bits
 from leaderboard.reproduce import command, figures, page, run, study, tables
 from leaderboard.reproduce.claims import Claim, Verdict, falling, same_order
 from leaderboard.reproduce.profiles import CPU, SMOKE, Materials, Setting
@@ -316,6 +319,28 @@ def test_median_counts_a_sample_without_a_value_as_the_worst() -> None:
     assert values["n"] == "2/5"
     assert "seeds 0 to 5" in page.format_heading(table)
     assert json.loads(json.dumps(page.to_json(table), allow_nan=False))["rows"][0]["ours"]["median"]["ours"] == "inf"
+
+
+@pytest.mark.parametrize("name", ["table1", "table4"])
+def test_identification_has_rank_1_and_bits_in_tables_1_and_4(name: str) -> None:
+    measures = tables.load_tables()[name].measures
+    definition = replace(TABLE, measures=measures, build_claims=lambda paper: (), rank_measure=None)
+    setting = Setting(profile=CPU, materials=Materials(), extractor=Sift(), photographs=8)
+    values = [1.0, 1.0, 1.0, 0.5, 1 / 9, 1 / 60, 1 / 128.5, 1 / 2]
+    records = tuple(build_record(str(number), {"identified": value}) for number, value in enumerate(values))
+    row = build_rows(setting)[0]
+    result = RunResult(rows=(row,), experiment_ids={row.name: ("id",)}, records={"id": records})
+    table = run.compare_with_paper(definition, setting, EvaluationSet(name="photographs", names=("0",) * 8, available=8), result)
+    (texts,) = list_texts(page.compare_values(table))
+    labels = list(texts)
+    first = labels.index("ssim, ours") + 1
+    assert all(label.startswith("identified") for label in labels[first : first + 3])
+    wilson, bits = binomtest(3, 8).proportion_ci(0.95, method="wilson"), measure_bits(values)
+    assert texts["identified, rank 1 (chance 0.0039)"] == f"0.38 [{wilson.low:.2f}, {wilson.high:.2f}] (3 of 8)"
+    assert texts["identified, bits of 8 (chance 0)"] == f"{bits.mean:.1f} [{bits.low:.1f}, {bits.high:.1f}]"
+    mean = (3 + 0.5 + 1 / 9 + 1 / 60 + RECIPROCAL_RANK + 0.5) / 8
+    assert texts["identified (chance 0.024)"].startswith(f"{mean:.3f} [")
+    assert any("rank 1 for 1 of 256, and 0 bits" in remark for remark in page.list_remarks(table))
 
 
 SIGNAL_ROWS = {"raw": build_values(0.6), "two": build_values(0.4), "four": build_values(0.11)}

@@ -436,6 +436,27 @@ def test_on_a_phone_nothing_runs_over_the_side(phone: Any) -> None:
     assert fits()
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("width", [1420, 390])
+def test_identification_is_beside_ssim_and_in_sight(browser: Any, tmp_path: Path, width: int) -> None:
+    records = [*reconstructions(ldp(4.0), [0.4, 0.5, 0.3] * 2), *baselines(NONE, 6)]
+    for record, value in zip(records, [1.0, 1.0, 0.25, 1.0, 1 / 30, 0.5, *[1 / 128.5] * 12], strict=True):
+        record["metrics"] |= {"identified": value, "psnr": 15.0, "face": 0.5}
+    index = site.write([fabricated.write(tmp_path / "runs", records)], tmp_path / "site").page
+    for page in opened(browser, index, {"width": width, "height": 900}):
+        names = page.locator("thead th").evaluate_all("all => all.map(one => one.dataset.column)")
+        assert names[names.index("ssim") + 1] == "identified"
+        assert not {"identified_rank_1", "identified_bits"} & set(names), "they are in the column of identified"
+        entry = page.locator('tbody tr:visible [data-column="identified"]').first
+        frame, box = position(page.locator(".frame")), position(entry)
+        assert frame["x"] <= box["x"]
+        assert box["x"] + box["width"] <= frame["x"] + frame["width"]
+        text = entry.inner_text().replace("\xa0", " ")
+        assert re.fullmatch(r"0\.6\d+\s\[.+\]\s*3 of 6 \[0\.19, 0\.81\]\s*\d\.\d bits \[\d\.\d, \d\.\d\]", text)
+        page.locator("tr:visible .open").first.click()
+        assert "identified, bits of 8 (chance 0)" in dialog(page).inner_text()
+
+
 @pytest.mark.exhaustive
 def test_strings_of_users_are_text(page: Any) -> None:
     page.locator(".group:visible .only").uncheck()

@@ -12,8 +12,11 @@ from record_lines import record
 from rich.console import Console
 from scipy import stats
 
+from bench.core.errors import UserError
 from bench.core.table import Table, to_csv, to_markdown, to_terminal
 from leaderboard import figures, tables
+from leaderboard.chance import RECIPROCAL_RANK
+from leaderboard.identification import measure_bits
 
 SIFT = {"name": "sift", "upright": True}
 
@@ -71,6 +74,38 @@ def test_fractions_have_wilsons_interval() -> None:
         f"0.7 [{expected.low:.4g}, {expected.high:.4g}]",
         "n/a",
     ]
+
+
+def test_identification_has_rank_1_and_bits_beside_ssim() -> None:
+    values = [1.0] * 7 + [0.5, 1 / 30, 1 / 128.5]
+    records = [
+        record(str(number), metrics={"ssim": 0.5, "psnr": 9.0, "identified": value}) for number, value in enumerate(values)
+    ]
+    (table,) = tables.build_tables([*records, NA])
+    labels = [column.label for column in table.columns]
+    first = labels.index("SSIM")
+    assert labels[first + 1 : first + 5] == [
+        "identified (chance 0.024)",
+        "identified, rank 1 (chance 0.0039)",
+        "identified, bits of 8 (chance 0)",
+        "PSNR",
+    ]
+    wilson, bits = stats.binomtest(7, 10).proportion_ci(0.95, "wilson"), measure_bits(values)
+    mean = (7 + 0.5 + 1 / 30 + RECIPROCAL_RANK) / 10
+    assert table.rows[0].texts[first + 1 : first + 4] == (
+        f"{mean:.4g}",
+        f"0.7 [{wilson.low:.4g}, {wilson.high:.4g}] (7 of 10)",
+        f"{bits.mean:.4g} [{bits.low:.4g}, {bits.high:.4g}]",
+    )
+    assert table.rows[1].texts[first + 1 : first + 4] == ("n/a",) * 3
+    (brief,) = tables.build_tables([*records, NA], brief=True)
+    shown = [show(brief, index)["identified (chance 0.024)"] for index in range(2)]
+    assert shown == [f"{mean:.2f}, 7 of 10\n{bits.mean:.1f} bits [{bits.low:.1f}, {bits.high:.1f}]", "n/a"]
+
+
+def test_an_impossible_reciprocal_rank_is_an_error() -> None:
+    with pytest.raises(UserError, match="reciprocal rank 2"):
+        tables.build_tables([record(metrics={"identified": 2.0})])
 
 
 def test_the_smaller_of_two_compositions_is_shown() -> None:

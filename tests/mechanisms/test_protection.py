@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import bench
-from bench.codebook.examples import draw_features, write_dictionary
+from bench.codebook.examples import draw_features
 from bench.codebook.public import Public
 from bench.core.errors import UserError
 from bench.mechanisms import protection
@@ -17,11 +17,6 @@ from bench.testing import are_equal
 from bench.types import Descriptors, WordSets
 from defenses.ldp import LDP
 from defenses.none import Undefended
-
-
-@pytest.fixture
-def small(tmp_path: Path) -> Asset:
-    return write_dictionary(tmp_path)
 
 
 def words(release: object) -> np.ndarray:

@@ -16,7 +16,7 @@ from fake_plugins.broken import Broken
 from fake_plugins.glimpse import Glimpse
 from fake_plugins.guess import Guess
 from fake_plugins.sketch import Sketch
-from fakes import FAKES, install_plugins, prepare_plan, write_album
+from fakes import FAKES, install_plugins, prepare_plan
 from PIL import Image
 
 from attacks.repeat import Repeat
@@ -43,16 +43,6 @@ RECONSTRUCTION = Reconstruction(inverter="sketch")
 @pytest.fixture(autouse=True)
 def _fakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     install_plugins(tmp_path / "installed", monkeypatch, FAKES)
-
-
-@pytest.fixture
-def images(tmp_path: Path) -> Path:
-    return write_album(tmp_path / "album")
-
-
-@pytest.fixture
-def small(tmp_path: Path) -> Asset:
-    return write_dictionary(tmp_path)
 
 
 def run(defenses: list[Defense], attacks: list[Attack], images: Any, task: Task = RECONSTRUCTION, **more: Any) -> list[Record]:
@@ -424,6 +414,7 @@ def test_selected_keypoints_alone_are_scored_and_reconstructed(images: Path, mon
     )
     found = run([Undefended()], [Glimpse()], images)
     assert [record["metrics"]["l2"] for record in found] == [0, 0]
+    assert "identified-scene" not in found[0]["metric_settings"], "photographs have no other views"
     assert seen == [-(-record["metrics"]["keypoints"] // 2) for record in found]
 
 
@@ -442,3 +433,5 @@ def test_foreground_and_background_of_a_scene_are_scored_separately(tmp_path: Pa
     assert found["mae_foreground"] != found["mae_background"]
     assert record["condition"] == "day"
     assert record["dataset"]["spec"]["name"] == "gallery"
+    assert "identified-scene" in found
+    assert "identified-scene" in record["metric_settings"]

@@ -18,7 +18,6 @@ from fakes import FAKES, check_plan, install_plugins, prepare_plan, write_album
 
 from attacks.dia import DIA
 from bench import cli
-from bench.codebook.examples import write_dictionary
 from bench.core import threads
 from bench.core.errors import UserError
 from bench.datasets.gallery import Gallery
@@ -55,11 +54,6 @@ def _fakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def images(tmp_path: Path) -> Path:
     return write_album(tmp_path / "album", 3)
-
-
-@pytest.fixture
-def small(tmp_path: Path) -> Asset:
-    return write_dictionary(tmp_path)
 
 
 @pytest.fixture

@@ -7,11 +7,18 @@ from collections.abc import Mapping
 
 from bench.api import Defense
 from bench.registry import discovery
-from leaderboard.chance import IDENTIFIED, label_identified
 from leaderboard.reproduce import published
 from leaderboard.reproduce.claims import Claim, Statement, TableEntry, at_least, falling, same_order
 from leaderboard.reproduce.profiles import Setting
-from leaderboard.reproduce.study import Measure, Row, Table, build_baseline_rows, build_plugin, build_reconstruction
+from leaderboard.reproduce.study import (
+    Measure,
+    Row,
+    Table,
+    build_baseline_rows,
+    build_identification_measures,
+    build_plugin,
+    build_reconstruction,
+)
 
 PRINTED = ("mae", "ssim", "psnr")
 DIMS = (2, 4, 8, 16)
@@ -111,8 +118,8 @@ TABLE = Table(
     measures={
         "mae": Measure(metric="mae", digits=4),
         "ssim": Measure(metric="ssim", digits=4),
+        **build_identification_measures(),
         "psnr": Measure(metric="psnr", digits=2),
-        label_identified(): Measure(metric=IDENTIFIED, digits=3),
         "recovered": Measure(metric="recovered", factor=100, digits=1),
         "angle": Measure(metric="angle", digits=1),
     },

@@ -8,11 +8,18 @@ from collections.abc import Mapping
 from bench.codebook.public import Public
 from bench.core.errors import UserError
 from bench.registry import discovery
-from leaderboard.chance import IDENTIFIED, label_identified
 from leaderboard.reproduce import published, scale
 from leaderboard.reproduce.claims import Claim, TableEntry, about_equal, falling, greater, same_order
 from leaderboard.reproduce.profiles import Setting
-from leaderboard.reproduce.study import Measure, Row, Table, build_baseline_rows, build_plugin, build_reconstruction
+from leaderboard.reproduce.study import (
+    Measure,
+    Row,
+    Table,
+    build_baseline_rows,
+    build_identification_measures,
+    build_plugin,
+    build_reconstruction,
+)
 from leaderboard.reproduce.tables import table1
 
 PRINTED = ("mae", "ssim", "psnr")
@@ -119,8 +126,8 @@ TABLE = Table(
     measures={
         "mae": Measure(metric="mae", digits=4),
         "ssim": Measure(metric="ssim", digits=4),
+        **build_identification_measures(),
         "psnr": Measure(metric="psnr", digits=2),
-        label_identified(): Measure(metric=IDENTIFIED, digits=3),
     },
     build_rows=build_rows,
     build_claims=build_claims,
