@@ -16,7 +16,7 @@ from leaderboard.comparison import ComparisonGroup, GroupedExperiment
 from leaderboard.intervals import LEVEL, Interval
 from leaderboard.measures import Measure
 from leaderboard.ranking import Standing, rank_defenses
-from leaderboard.tables import COMPOSITION_REMARK, SEED_REMARK, format_chance, format_number, spent_epsilon
+from leaderboard.tables import COMPOSITION_REMARK, SEED_REMARK, format_chance, format_number, list_rejected, spent_epsilon
 
 Value = Interval | float | int | str | None
 
@@ -232,6 +232,7 @@ def _list_notes(group: ComparisonGroup, experiment: GroupedExperiment, standing:
     if verdict and verdict.is_absent and verdict.text != unranked_reason:
         yield verdict.text
     completed = experiment.completed
+    yield from list_rejected(completed)
     first_notes = completed[0].get("notes", ()) if completed else ()
     yield from (note for note in first_notes if all(note in record["notes"] for record in completed))
     if uncovered := [part for part in experiment.metadata["privacy"].get("uncovered", ()) if part not in UNCOVERED]:
