@@ -41,6 +41,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         parser.add_argument(
             f"--{network}-network", metavar="FILE", help=f"network trained for `{defense}` (default: the shipped one)"
         )
+    for defense, stacked in (("affine", "stacked origin and basis"), ("ldp", "stacked words")):
+        parser.add_argument(
+            f"--as-printed-{defense}",
+            metavar="FILE",
+            help=f"network trained for `{defense}` with the paper's input, {stacked} (default: the shipped one, if there is one)",
+        )
 
 
 def execute(args: argparse.Namespace) -> int:
