@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import get_args
 
 from bench.api import Extractor
 from bench.core.errors import unknown_name
 from bench.datasets.gallery import Gallery
 from bench.datasets.walk import Walk
 from bench.settings import Asset
+from bench.sfm.incremental_mapping import Mapper
+from bench.tasks.structure import Matching
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,6 +35,8 @@ class Profile:
     walk_scale: float  # `scale` of that table
     walk_keypoints: int  # maximum number per image for that table
     seeds: int  # number of seeds of that table
+    walk_variants: tuple[tuple[Mapper, Matching], ...] = (("global", "unique-words"),)  # of that table; claims rest on the first
+    walk_max_matched: int = 0  # largest m of that table whose words are matched by descriptors
     # Values of fields that save time, for attacks with these fields. All other fields have their tuned defaults.
     attack_overrides: Mapping[str, int] = field(default_factory=dict)
 
@@ -56,6 +62,8 @@ SMOKE = Profile(
     walk_scale=1 / 256,
     walk_keypoints=1000,
     seeds=1,
+    walk_variants=(("global", "unique-words"), ("incremental", "descriptors")),
+    walk_max_matched=4,
     attack_overrides={"others": 8},
 )
 CPU = Profile(
@@ -74,6 +82,14 @@ CPU = Profile(
     walk_keypoints=2000,
     seeds=6,
 )
+# Table S2 with COLMAP's default limit of keypoints, both mappers, and matches that need not be unique.
+DENSE = dataclasses.replace(
+    CPU,
+    name="dense",
+    walk_keypoints=8192,
+    walk_variants=tuple(itertools.product(get_args(Mapper), get_args(Matching))),
+    walk_max_matched=8,
+)
 PAPER = Profile(
     name="paper",
     photographs=1_000_000,
@@ -89,8 +105,10 @@ PAPER = Profile(
     walk_scale=1.0,
     walk_keypoints=8192,
     seeds=6,
+    walk_variants=DENSE.walk_variants,
+    walk_max_matched=64,
 )
-PROFILES = {profile.name: profile for profile in (SMOKE, CPU, PAPER)}
+PROFILES = {profile.name: profile for profile in (SMOKE, CPU, DENSE, PAPER)}
 
 
 @dataclass(frozen=True, kw_only=True)

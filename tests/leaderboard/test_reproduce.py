@@ -229,7 +229,7 @@ def test_interrupted_reproduction_resumes_with_the_same_result(
     ("words", "complaint"),
     [
         (("table7",), "unknown table 'table7'; did you mean"),
-        (("table1", "--profile", "big"), "unknown profile 'big'; available: cpu, paper, smoke"),
+        (("table1", "--profile", "big"), "unknown profile 'big'; available: cpu, dense, paper, smoke"),
         (("table4", "--profile", "paper"), "has 256,000 words, and profile paper needs 512,000"),
         (("tableS3", "--images", "nowhere"), "no such folder"),
         (("tableS3", "--database", "nowhere.safetensors"), "nowhere.safetensors"),

@@ -100,8 +100,8 @@ TABLE = Table(
         *scenes.NOTES,
         "The columns of trials show the largest number that RANSAC is allowed; the column `trials` shows the mean number made. A "
         "row of ours is comparable with a row of the paper in its order, not in its number of trials.",
-        "Both dictionaries are clustered into as many words. That of the row Places365 is clustered from the shipped words, which "
-        "are of other photographs, since their descriptors are not shipped.",
+        "Both dictionaries are clustered into as many words. That of the row Places365 is clustered from the shipped words of "
+        "other photographs, since the descriptors of these photographs are not shipped.",
         "The last row is not in the paper. It retrieves references by the released words alone.",
     ),
 )

@@ -139,8 +139,8 @@ TABLE = Table(
     notes=(
         "The same network inverts all rows. Where |K| is scaled by s, ε is shifted by ln s: the chance that the true word is "
         "released stays the paper's, the guarantee is that of our ε.",
-        "Our smaller |K| has the dictionary's first words, a random sample of its clusters, because the networks are trained with "
-        "them. The paper clusters each |K|, which brings words closer to descriptors.",
+        "Our smaller |K| has the dictionary's first words, a random sample of its clusters, because the networks are trained "
+        "with them. The paper clusters each |K|, which brings words closer to descriptors.",
         AS_PRINTED_NOTE,
     ),
 )
