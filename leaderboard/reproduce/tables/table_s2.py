@@ -211,8 +211,8 @@ TABLE = Table(
         "Where |K| is scaled by s, ε is shifted by ln s: the chance that the true word is released stays the paper's, the "
         "guarantee is that of our ε. The dictionary is from images of the scene that are not mapped.",
         "Matching: unique-words, by words that are unique in both images; words, by all words that both images release; "
-        "descriptors, by words with mutually nearest descriptors. `--profile dense` has up to 8,192 keypoints per image, both mappers and all "
-        "matchings, descriptors up to m = 8.",
+        "descriptors, by words with mutually nearest descriptors. `--profile dense` has up to 8,192 keypoints per "
+        "image, both mappers and all matchings, descriptors up to m = 8.",
         "Intervals are over seeds, of releases and of mapping, in this one scene; n counts the seeds with a model.",
     ),
 )
