@@ -172,7 +172,7 @@ class _LocalInputs:
     def __init__(self, images: Path | None, files: Sequence[Path]) -> None:
         self.images = None if images is None else list_photographs(images)
         shipped = {Asset(name): _read_digest(ASSETS / file) for name, file in SHIPPED.items() if (ASSETS / file).is_file()}
-        clustered = {Asset(name): name_digest(shipped[source]) for name, source in CLUSTERED.items() if source in shipped}
+        clustered = {Asset(name): name_digest(shipped[Asset(source)]) for name, source in CLUSTERED.items() if source in shipped}
         own = {Asset(file): _read_digest(file) for file in files}
         self.assets = {digest: name for name, digest in (shipped | clustered | own).items()}  # digest -> value of a field
 

@@ -77,7 +77,7 @@ def build_reference_rows(setting: Setting) -> tuple[Row, ...]:
                 replace(
                     row,
                     name=f"{row.name}{SEPARATOR}{mapper}, {matching}",
-                    labels=row.labels | {"mapper": mapper, "matching": matching},
+                    labels={**row.labels, "mapper": mapper, "matching": matching},
                     task=Structure(images=setting.profile.walk.views, mapper=mapper, matching=matching),
                 )
             )
