@@ -17,7 +17,7 @@ from bench.types import Indices, Subspaces
 if TYPE_CHECKING:
     from torch import Tensor
 
-STEP = 1024  # rows of a block of distances
+STEP = 128  # rows of a block of distances, so that blocks stay small
 
 
 def points_to_points(one: Tensor, other: Tensor) -> Tensor:
@@ -96,10 +96,12 @@ def find_mutual_nearest_points(one: Tensor, other: Tensor, ratio: float = 1.0, s
         values, rows = squared.min(dim=0)
         closer = values < least  # ties to the lowest row
         least[closer], nearest_rows[closer] = values[closer], rows[closer] + start
-        columns.append(squared.argmin(dim=1))
+        nearest = squared.argmin(dim=1, keepdim=True)
+        columns.append(nearest[:, 0])
         if ratio < 1 and len(other) > 1:
-            nearest, second = squared.topk(2, dim=1, largest=False).values.T
-            passed.append(nearest < ratio**2 * second)
+            distance = squared.gather(1, nearest)[:, 0]
+            second = squared.scatter_(1, nearest, torch.inf).amin(dim=1)
+            passed.append(distance < ratio**2 * second)
     column = torch.cat(columns)  # (N,)
     mutual = nearest_rows[column] == torch.arange(len(one), device=one.device)
     if passed:

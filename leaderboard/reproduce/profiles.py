@@ -11,6 +11,7 @@ from typing import get_args
 from bench.api import Extractor
 from bench.core.errors import unknown_name
 from bench.datasets.gallery import Gallery
+from bench.datasets.hard_night import HardNight
 from bench.datasets.walk import Walk
 from bench.settings import Asset
 from bench.sfm.incremental_mapping import Mapper
@@ -28,7 +29,7 @@ class Profile:
     scale: float  # factor of each |K| of a table that varies it; its logarithm is added to each ε
     subspaces: int  # total number for Table S3
     other_releases: int  # maximum number for Table S4
-    gallery: Gallery  # default dataset of the localization tables
+    gallery: Gallery  # of figures of queries; by day, also of the localization tables
     gallery_scale: float  # `scale` of these tables
     trials: float  # RANSAC's trials, as a fraction of the paper's
     walk: Walk  # default dataset of the structure-from-motion table
@@ -39,6 +40,21 @@ class Profile:
     walk_max_matched: int = 0  # largest m of that table whose words are matched by descriptors
     # Values of fields that save time, for attacks with these fields. All other fields have their tuned defaults.
     attack_overrides: Mapping[str, int] = field(default_factory=dict)
+
+    @property
+    def hard_night(self) -> HardNight:
+        """The default dataset of the localization tables: the gallery with a night that is hard to localize."""
+        gallery = self.gallery
+        return HardNight(
+            seed=gallery.seed,
+            views=gallery.views,
+            queries=gallery.queries,
+            night=gallery.night,
+            width=gallery.width,
+            height=gallery.height,
+            rooms=gallery.rooms,
+            detail=gallery.detail,
+        )
 
     @property
     def figure_gallery(self) -> Gallery:
@@ -88,7 +104,7 @@ DENSE = dataclasses.replace(
     name="dense",
     walk_keypoints=8192,
     walk_variants=tuple(itertools.product(get_args(Mapper), get_args(Matching))),
-    walk_max_matched=8,
+    walk_max_matched=4,
 )
 PAPER = Profile(
     name="paper",

@@ -32,9 +32,9 @@ NOTES = (
 )
 
 
-def select_gallery(profile: Profile) -> Dataset:
-    """Return the default dataset of the localization tables."""
-    return profile.gallery
+def select_scene(profile: Profile) -> Dataset:
+    """Return the default dataset of the localization tables, which share their records."""
+    return profile.hard_night
 
 
 def build_task(setting: Setting, trials: int = TRIALS, **configuration: Any) -> Localization:

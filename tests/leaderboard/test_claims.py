@@ -327,6 +327,16 @@ def test_table_3_shows_the_trials_of_the_paper_and_ours() -> None:
 
 
 @pytest.mark.slow
+def test_table_3_clusters_both_dictionaries_into_as_many_words() -> None:
+    defenses = {row.name: row.defense for row in table3.build_rows(SETTING)}
+    ours, other = defenses["Aachen Ref."], defenses["Places365"]
+    assert isinstance(ours, LDP)
+    assert isinstance(other, LDP)
+    assert (ours.dictionary, other.dictionary) == ("references", "shipped-clustered")
+    assert dataclasses.replace(other, dictionary=ours.dictionary) == ours
+
+
+@pytest.mark.slow
 def test_table_3_shares_the_row_of_its_point_with_table_2() -> None:
     point = next(row for row in table2.build_rows(SETTING) if row.name == "|K| 256k, ε 10, m 2")
     own = {row.name: row for row in table3.build_rows(SETTING)}

@@ -117,7 +117,7 @@ TABLE = Table(
     measures={**scenes.build_recall_measures(recall="day"), **scenes.build_error_measures("day")},
     build_rows=build_rows,
     build_claims=build_claims,
-    dataset=scenes.select_gallery,
+    dataset=scenes.select_scene,
     rank_measure=MEASURE,
     notes=(*scenes.NOTES, f"The rows `{RELEASED_GROUP}` are not in the paper. They use nothing of the query beyond its release."),
 )

@@ -212,7 +212,7 @@ TABLE = Table(
         "guarantee is that of our ε. The dictionary is from images of the scene that are not mapped.",
         "Matching: unique-words, by words that are unique in both images; words, by all words that both images release; "
         "descriptors, by words with mutually nearest descriptors. `--profile dense` has up to 8,192 keypoints per "
-        "image, both mappers and all matchings, descriptors up to m = 8.",
+        "image, both mappers and all matchings, descriptors up to m = 4.",
         "Intervals are over seeds, of releases and of mapping, in this one scene; n counts the seeds with a model.",
     ),
 )
