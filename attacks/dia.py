@@ -34,6 +34,9 @@ from bench.settings import Asset
 from bench.threat_model import PublicAssets
 from bench.types import Descriptors, Floats, Subspaces, WordSets
 
+# File names of the shipped networks. As printed: the input is the words of a set, or origin and basis of a subspace, stacked.
+SHIPPED = {"shipped": "inversion-*.safetensors", "shipped-as-printed": "as-printed-*.safetensors"}
+
 
 @dataclass(frozen=True, kw_only=True)
 class DIA(ImageAttack):
@@ -70,17 +73,18 @@ class DIA(ImageAttack):
 
 def _choose(asset: str, defense: Defense, extractor: Extractor, public: Public) -> tuple[Path | None, str | None]:
     """Return the path of the weights for these releases, or the reason why there are none."""
-    candidates = sorted(ASSETS.glob("inversion-*.safetensors")) if asset == "shipped" else [Path(asset)]
+    candidates = sorted(ASSETS.glob(SHIPPED[asset])) if asset in SHIPPED else [Path(asset)]
     reasons = []
     for path in candidates:
         meta = load(path).meta
         reason = explain_incompatible(meta, defense, extractor, public)
         if reason is None:
             return path, None
-        if asset != "shipped" or meta["defense"]["name"] == defense.name():
+        if asset not in SHIPPED or meta["defense"]["name"] == defense.name():
             reasons.append(f"{path.name} was {reason}")
     details = f" ({'; '.join(reasons)})" if reasons else ""
-    return None, f"no adapted attacker{details}; train one with `bench train` and pass dia:weights=FILE"
+    command = "bench train --encoding released" if asset == "shipped-as-printed" else "bench train"
+    return None, f"no adapted attacker{details}; train one with `{command}` and pass dia:weights=FILE"
 
 
 PLUGIN = DIA

@@ -26,6 +26,10 @@ def execute_in_process(method: Callable[[View, np.random.Generator], Any], view:
     return method(view, rng)
 
 
+# Start of the note on a query whose intrinsics are wrong, since its raw features fit another focal length.
+REJECTED = "intrinsics rejected"
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ExtractedImage:
     """One image of a sample, and the secret extracted from it."""

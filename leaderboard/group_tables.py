@@ -23,6 +23,7 @@ from leaderboard.tables import (
     format_fraction,
     format_interval,
     format_number,
+    list_rejected,
     spent_epsilon,
 )
 
@@ -257,6 +258,7 @@ def _list_notes(group: ComparisonGroup, experiment: GroupedExperiment, standing:
     if verdict and verdict.is_absent and verdict.text != unranked_reason:
         yield verdict.text
     completed = experiment.completed
+    yield from list_rejected(completed)
     first_notes = completed[0].get("notes", ()) if completed else ()
     yield from (note for note in first_notes if all(note in record["notes"] for record in completed))
     if uncovered := [part for part in experiment.metadata["privacy"].get("uncovered", ()) if part not in UNCOVERED]:

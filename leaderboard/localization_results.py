@@ -20,9 +20,9 @@ ESTIMATES = "estimates"
 def write(records: Iterable[Record], out: Path) -> Iterator[str]:
     """Write the files into `out`, from records alone, and yield a line of text for each file.
 
-    Each defense on Aachen has a file `Aachen_eval_[method].txt`. It excludes the queries that failed or were not localized, and
-    the line states their number. `pairs.txt` has the retrieved images. If they differ between defenses, each defense has a file
-    `pairs-[method].txt`.
+    Each defense on Aachen has a file `Aachen_eval_[method].txt`. It excludes the queries that failed, were rejected for their
+    intrinsics, or were not localized, and the line states their number. `pairs.txt` has the retrieved images. If they differ
+    between defenses, each defense has a file `pairs-[method].txt`.
 
     Raises
     ------
@@ -54,7 +54,7 @@ def write(records: Iterable[Record], out: Path) -> Iterator[str]:
         if experiment[0]["dataset"]["name"] == "aachen":
             poses = {record["sample"]: _read_pose(record) for record in experiment}
             path, missing = aachen.write_evaluation(out, method, poses)
-            yield f"{path}: {len(poses) - missing} poses; {missing} queries that failed are left out"
+            yield f"{path}: {len(poses) - missing} poses; {missing} queries without a pose are left out"
 
 
 def _name_methods(experiments: list[list[Record]]) -> list[str]:

@@ -17,7 +17,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 from bench.api import Plugin
-from bench.codebook.public import ASSETS, REFERENCES, SHIPPED
+from bench.codebook.clustered import name_digest
+from bench.codebook.public import ASSETS, CLUSTERED, REFERENCES, SHIPPED
 from bench.core.errors import SampleError, UserError
 from bench.core.progress import Progress
 from bench.images.photographs import list_photographs
@@ -170,8 +171,10 @@ class _LocalInputs:
 
     def __init__(self, images: Path | None, files: Sequence[Path]) -> None:
         self.images = None if images is None else list_photographs(images)
-        shipped = {_read_digest(ASSETS / file): Asset(name) for name, file in SHIPPED.items() if (ASSETS / file).is_file()}
-        self.assets = shipped | {_read_digest(file): Asset(file) for file in files}  # digest -> value of a field
+        shipped = {Asset(name): _read_digest(ASSETS / file) for name, file in SHIPPED.items() if (ASSETS / file).is_file()}
+        clustered = {Asset(name): name_digest(shipped[Asset(source)]) for name, source in CLUSTERED.items() if source in shipped}
+        own = {Asset(file): _read_digest(file) for file in files}
+        self.assets = {digest: name for name, digest in (shipped | clustered | own).items()}  # digest -> value of a field
 
     def photographs(self, record: Record) -> Images:
         """Return the photographs of a record.

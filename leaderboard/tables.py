@@ -13,6 +13,7 @@ from bench.core.table import NOT_APPLICABLE, Column, Row, Table
 from bench.mechanisms.composition import DELTA, UNCOVERED
 from bench.registry import discovery
 from bench.runner.records import Record, keep_latest
+from bench.task_api import REJECTED
 from leaderboard.chance import (
     IDENTIFICATION,
     explain_identification,
@@ -244,7 +245,13 @@ def _list_notes(records: list[Record], completed: list[Record], signal: Signal |
     by_distance = records[0]["privacy"].get("epsilon_per_distance")
     other = [] if by_distance is None else [f"not ε-LDP: ε = {format_number(by_distance)} per unit of distance"]
     at_baseline = [signal.text] if signal and signal.is_absent else []
-    return [*at_baseline, *other, *shared, *beyond]
+    return [*at_baseline, *other, *list_rejected(completed), *shared, *beyond]
+
+
+def list_rejected(completed: Sequence[Record]) -> list[str]:
+    """Return a note on the number of queries that were rejected for their intrinsics, if there are any."""
+    count = sum(any(note.startswith(REJECTED) for note in record["notes"]) for record in completed)
+    return [f"{count} of {len(completed)} queries rejected for their intrinsics: not localized"] if count else []
 
 
 def _list_failures(experiments: Sequence[list[Record]], labels: Sequence[tuple[str, str]]) -> list[str]:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bench.codebook import dictionary
+from bench.codebook import clustered, dictionary
 from bench.codebook.dictionary import Dictionary
 from bench.core.errors import UserError
 from bench.types import Bytes, Features, Floats, Indices
@@ -21,7 +21,9 @@ ASSETS = Path(__file__).parents[1] / "assets"
 # The files of the shipped assets. The attacker's database is built from other photographs.
 SHIPPED = {"shipped": "dictionary.safetensors", "shipped-public": "public-database.safetensors"}
 REFERENCES = "references"
+CLUSTERED = {"shipped-clustered": "shipped"}  # dictionaries that are clustered from the words of another one
 
+Clusterer = Callable[[Dictionary, int], Dictionary]
 Quantiser = Callable[[Dictionary, Bytes | Floats], Indices]
 
 
@@ -34,6 +36,7 @@ class Public:
     cache_size : number of photographs whose quantisation is cached; 0 makes quantisation thread-safe
     dictionaries : further dictionaries by name, held in memory
     scene_index : the server's index; the dictionary `references` is built from its reference images
+    clusterer : function that clusters a dictionary into fewer words
     """
 
     def __init__(
@@ -42,9 +45,11 @@ class Public:
         cache_size: int = 64,
         dictionaries: Mapping[str, Dictionary] | None = None,
         scene_index: SceneIndex | None = None,
+        clusterer: Clusterer = clustered.cluster_words,
     ) -> None:
         self.scene_index = scene_index
         self._quantiser = quantiser
+        self._clusterer = clusterer
         self._dictionaries = {(name, 0): dictionary for name, dictionary in (dictionaries or {}).items()}
         self._quantised: OrderedDict[str, Indices] = OrderedDict()
         self._cache_size = cache_size
@@ -52,7 +57,8 @@ class Public:
     def dictionary(self, asset: str, words: int = 0) -> Dictionary:
         """Return the first `words` words (0: all) of `shipped`, of `shipped-public` or of a file.
 
-        For `references`, return that many words, clustered from the reference images of the scene.
+        For `references`, return that many words, clustered from the reference images of the scene. For `shipped-clustered`,
+        return that many words, clustered from the words of `shipped`.
 
         Raises
         ------
@@ -62,6 +68,9 @@ class Public:
         if (asset, words) not in self._dictionaries:
             if asset == REFERENCES:  # clustered into exactly that many words; the first words of a larger clustering are worse
                 result = self._require_scene_index().build_dictionary(words)
+            elif asset in CLUSTERED:
+                source = self.dictionary(CLUSTERED[asset])
+                result = self._clusterer(source, words) if words else source
             else:
                 result = self.dictionary(asset).first(words) if words else dictionary.load(dictionary_path(asset))
             self._dictionaries[asset, words] = result
@@ -75,7 +84,11 @@ class Public:
         UserError
             if the dictionary is missing or damaged.
         """
-        return self._require_scene_index().digest if asset == REFERENCES else self.dictionary(asset).digest
+        if asset == REFERENCES:
+            return self._require_scene_index().digest
+        if asset in CLUSTERED:
+            return clustered.name_digest(self.dictionary(CLUSTERED[asset]).digest)
+        return self.dictionary(asset).digest
 
     def _require_scene_index(self) -> SceneIndex:
         if self.scene_index is None:

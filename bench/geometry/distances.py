@@ -17,6 +17,8 @@ from bench.types import Indices, Subspaces
 if TYPE_CHECKING:
     from torch import Tensor
 
+STEP = 128  # rows of a block of distances, so that blocks stay small
+
 
 def points_to_points(one: Tensor, other: Tensor) -> Tensor:
     """Return the squared distances of unit vectors. (N, D), (R, D) -> (N, R)"""
@@ -72,3 +74,37 @@ def find_mutual_nearest(squared: Tensor, ratio: float = 1.0) -> tuple[Indices, I
         mutual &= nearest < ratio**2 * second
     rows = mutual.nonzero()[:, 0]
     return rows.cpu().numpy(), columns[rows].cpu().numpy()
+
+
+def find_mutual_nearest_points(one: Tensor, other: Tensor, ratio: float = 1.0, step: int = STEP) -> tuple[Indices, Indices]:
+    """Return `find_mutual_nearest` of the squared distances of unit vectors, which are never all in memory.
+
+    Parameters
+    ----------
+    one, other : (N, D), (R, D)
+    step : number of rows of `one` at a time
+    """
+    import torch
+
+    if len(one) == 0 or len(other) == 0:
+        return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
+    least = torch.full((len(other),), torch.inf, device=one.device)  # of each column
+    nearest_rows = torch.zeros(len(other), dtype=torch.int64, device=one.device)
+    columns, passed = [], []
+    for start in range(0, len(one), step):
+        squared = points_to_points(one[start : start + step], other)
+        values, rows = squared.min(dim=0)
+        closer = values < least  # ties to the lowest row
+        least[closer], nearest_rows[closer] = values[closer], rows[closer] + start
+        nearest = squared.argmin(dim=1, keepdim=True)
+        columns.append(nearest[:, 0])
+        if ratio < 1 and len(other) > 1:
+            distance = squared.gather(1, nearest)[:, 0]
+            second = squared.scatter_(1, nearest, torch.inf).amin(dim=1)
+            passed.append(distance < ratio**2 * second)
+    column = torch.cat(columns)  # (N,)
+    mutual = nearest_rows[column] == torch.arange(len(one), device=one.device)
+    if passed:
+        mutual &= torch.cat(passed)
+    rows = mutual.nonzero()[:, 0]
+    return rows.cpu().numpy(), column[rows].cpu().numpy()

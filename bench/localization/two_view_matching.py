@@ -14,7 +14,13 @@ import numpy as np
 from bench.api import Defense
 from bench.codebook.public import Public
 from bench.core.device import pick_device
-from bench.geometry.distances import find_mutual_nearest, points_to_points, subspaces_to_points, subspaces_to_subspaces
+from bench.geometry.distances import (
+    find_mutual_nearest,
+    find_mutual_nearest_points,
+    points_to_points,
+    subspaces_to_points,
+    subspaces_to_subspaces,
+)
 from bench.geometry.shared_words import find_shared_words
 from bench.registry import fields
 from bench.types import Descriptors, Features, Indices, Points, Release, Subspaces, WordSets
@@ -56,6 +62,41 @@ def match_releases(first: Release, second: Release, ratio: float = 1.0, unique: 
     rows, columns = find_mutual_nearest(_compute_squared_distances(first, second), ratio)
     pairs = np.stack([rows // _count_descriptors(first), columns // _count_descriptors(second)], axis=1)
     return np.unique(pairs, axis=0)
+
+
+def match_by_word_descriptors(first: WordSets, second: WordSets, ratio: float = 1.0) -> Indices:
+    """Return matches of keypoints whose sets have a pair of mutually nearest words. -> (M, 2) distinct pairs, ascending
+
+    Distances are those of the words' descriptors. A word that both images release is nearest to itself. Each word counts once,
+    however many keypoints have it, so the ratio test compares different words, and all keypoints with a pair of words match.
+
+    Parameters
+    ----------
+    ratio : of Lowe's test; 1 disables it
+
+    Raises
+    ------
+    TypeError
+        if a release has no words of a dictionary.
+    """
+    rows, inverse = _list_words(first)
+    other_rows, other_inverse = _list_words(second)
+    one, other = find_mutual_nearest_points(rows, other_rows, ratio)
+    # Both words of a pair get the pair's number, and all others a number of their own. The sets then match by equal numbers.
+    numbers, other_numbers = np.arange(len(rows)), len(rows) + np.arange(len(other_rows))
+    other_numbers[other] = one
+    return find_shared_words(numbers[inverse], other_numbers[other_inverse])
+
+
+def _list_words(release: WordSets) -> tuple[Tensor, Indices]:
+    """Return the descriptors of the distinct words of a release, and the number of each word. -> (W, D), (N, m)"""
+    import torch
+
+    if release.words is None:
+        raise TypeError("matching by the descriptors of words needs words of a dictionary")
+    _, first, inverse = np.unique(release.words, return_index=True, return_inverse=True)
+    rows = release.candidates.reshape(-1, release.candidates.shape[2])[first]
+    return torch.from_numpy(np.ascontiguousarray(rows)).to(pick_device()), inverse.reshape(release.words.shape)
 
 
 def _compute_squared_distances(first: Release, second: Release) -> Tensor:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from bench.api import Attack, Dataset, Defense, Extractor, Metric, Plugin, Privacy
-from bench.cache import feature_cache
+from bench.cache import dictionary_cache, feature_cache
 from bench.codebook.public import Public
 from bench.core import environment, hashing
 from bench.core.errors import UserError
@@ -116,7 +116,7 @@ def build_plan(configuration: RunConfiguration, describe: Describe = environment
     collection = task.collect(configuration.images, dataset)
     hashes = {sample.name: sample.content_hash() for sample in collection.samples}
     index = None if collection.scene is None else SceneIndex(collection.scene, extractor)
-    public = Public(feature_cache.find_nearest_words, scene_index=index)
+    public = Public(feature_cache.find_nearest_words, scene_index=index, clusterer=dictionary_cache.cluster_words)
     dataset_record = {
         "name": collection.name,
         "spec": None if dataset is None else spec.to_json(dataset),

@@ -1,7 +1,8 @@
 """Localization: the server's error in the pose of a release's camera (the paper's Sec. 6.2).
 
 Queries are privatised, references are not. For each query the server retrieves references, matches the release with them, and
-estimates the pose with fixed intrinsics. A query without an estimate counts as not localized.
+estimates the pose with fixed intrinsics. A query without an estimate counts as not localized. So does a query whose intrinsics
+the server rejects: its record has a note that begins with `REJECTED`.
 """
 
 from __future__ import annotations
@@ -23,11 +24,12 @@ from bench.images.samples import Collection, Images
 from bench.images.scene import SceneImage
 from bench.localization import map_matching, pose
 from bench.localization.server import Server
-from bench.task_api import Outcome, Task, Trial
+from bench.task_api import REJECTED, Outcome, Task, Trial
 from bench.types import Features, Indices
 
 # Largest errors of a localized pose: units of length and degrees (Sattler et al., CVPR 2018).
 THRESHOLDS = {"0.25m_2deg": (0.25, 2.0), "0.5m_5deg": (0.5, 5.0), "5m_10deg": (5.0, 10.0)}
+COUNTS = ("matches", "inliers", "trials")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,18 +72,17 @@ class Localization(Task):
     def evaluate(self, trial: Trial) -> Outcome:
         query: SceneImage = trial.sample.subject
         server = Server(public=trial.public, camera=query.camera)
-        _check_intrinsics(server, trial.secret, query.name)
+        if (ratio := _find_focal_mismatch(server, trial.secret, query.name)) is not None:
+            return _reject(query, ratio)
         matcher = self._select_matcher(trial.defense)
         if matcher is None:
             raise SampleError(f"nothing matches {type(trial.release).__name__}")
         references, seed = self._retrieve(server, trial, query), int(trial.rng.integers(2**31))
         result = server.localize(trial.release, trial.defense, references, matcher, self.trials, seed)
-        counts = {
-            "matches": float(len(result.correspondences)),
-            "inliers": 0.0 if result.estimate is None else float(result.estimate.inliers.sum()),
-            "trials": 0.0 if result.estimate is None else float(result.estimate.trials),
-        }
-        cam_from_world = None if result.estimate is None else result.estimate.cam_from_world
+        estimate = result.estimate
+        numbers = (0, 0) if estimate is None else (estimate.inliers.sum(), estimate.trials)
+        counts = dict(zip(COUNTS, map(float, (len(result.correspondences), *numbers)), strict=True))
+        cam_from_world = None if estimate is None else estimate.cam_from_world
         estimates = {
             "pose": None
             if cam_from_world is None
@@ -104,13 +105,19 @@ class Localization(Task):
         return server.retrieve_by_release(trial.release, trial.defense, self.retrieved)
 
 
-def _check_intrinsics(server: Server, secret: Features, query: str) -> None:
-    """Raise SampleError if the intrinsics are wrong. Raw features decide, so that all defenses have the same queries."""
+def _find_focal_mismatch(server: Server, secret: Features, query: str) -> float | None:
+    """Return `Server.estimate_focal_mismatch`. Raw features decide, so that all defenses have the same queries rejected."""
     mismatches = server.scene_index.focal_mismatches
     if query not in mismatches:
         mismatches[query] = server.estimate_focal_mismatch(secret)
-    if (ratio := mismatches[query]) is not None:
-        raise SampleError(f"{query}: its intrinsics are wrong; its raw features fit {ratio:.2f} times the focal length")
+    return mismatches[query]
+
+
+def _reject(query: SceneImage, ratio: float) -> Outcome:
+    """Return the outcome of a query that counts as not localized because of its intrinsics. Its counts are not measured."""
+    scores = {} if query.cam_from_world is None else score_pose(None)
+    note = f"{REJECTED}: its raw features fit {ratio:.2f} times the focal length"
+    return Outcome(metrics={**scores, **dict.fromkeys(COUNTS)}, notes=(note,))
 
 
 def score_pose(errors: tuple[float, float] | None) -> dict[str, float | None]:

@@ -1,7 +1,7 @@
 """Structure from motion: a server's model of a scene, built from releases alone (the paper's supplement, Table S2).
 
-All images are privatised. Two keypoints match by a word that both images release and that is unique in each, by mutually
-nearest descriptors, or by mutually nearest subspaces. `bench/sfm/` verifies the pairs of images and builds the model.
+All images are privatised. Two keypoints match by words, by mutually nearest descriptors, or by mutually nearest subspaces.
+`bench/sfm/` verifies the pairs of images and builds the model.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
 
 import numpy as np
 
@@ -29,6 +29,10 @@ from bench.types import Descriptors, Release, Subspaces, WordSets
 if TYPE_CHECKING:
     import pycolmap
 
+# How word sets match: by words that both images release and that are unique in each, by all words that both release, or by
+# words with mutually nearest descriptors.
+Matching = Literal["unique-words", "words", "descriptors"]
+
 
 @dataclass(frozen=True, kw_only=True)
 class Structure(Task):
@@ -43,6 +47,7 @@ class Structure(Task):
     images: int = 25  # largest number of queries, the first ones of the scene
     ratio: float = 0.8  # of Lowe's test among descriptors; 1 disables it
     mapper: Mapper = "global"
+    matching: Matching = "unique-words"  # of word sets
 
     def __post_init__(self) -> None:
         if self.images < incremental_mapping.MIN_IMAGES:
@@ -51,6 +56,8 @@ class Structure(Task):
             raise UserError(f"structure: ratio must be above 0 and at most 1, got {self.ratio}")
         if self.mapper not in ("incremental", "global"):
             raise UserError(f"structure: mapper must be incremental or global, got {self.mapper}")
+        if self.matching not in get_args(Matching):
+            raise UserError(f"structure: matching must be one of {', '.join(get_args(Matching))}, got {self.matching}")
 
     def collect(self, images: Images, dataset: Dataset | None) -> Collection:
         if images is not None:
@@ -100,7 +107,9 @@ class Structure(Task):
         try:
             # No ratio test for subspaces: the distances to the nearest and the second nearest are about equal.
             ratio = 1.0 if isinstance(first, Subspaces) else self.ratio
-            return two_view_matching.match_releases(first, second, ratio, unique=True)
+            if self.matching == "descriptors" and isinstance(first, WordSets) and isinstance(second, WordSets):
+                return two_view_matching.match_by_word_descriptors(first, second, ratio)
+            return two_view_matching.match_releases(first, second, ratio, unique=self.matching == "unique-words")
         except TypeError as error:
             raise SampleError(str(error)) from None
 

@@ -5,7 +5,7 @@ statement says that a linear combination of entries lies in an open interval. Fo
 ∞). Student's t of that combination, paired by sample, tests both that it lies inside and that it lies outside. The p-value is
 twice the smaller one of the two, with Holm's correction over the statements of the claim. The statement holds or fails if it is
 at most `SIGNIFICANCE`. Otherwise the verdict is "cannot tell". It is also "cannot tell" if a row of the statement has no signal
-(`leaderboard/signal.py`), because its entries say nothing about the defense.
+(`leaderboard/signal.py`), because its entries say nothing about the defense, or if a `confounder` determines its entries.
 """
 
 from __future__ import annotations
@@ -43,6 +43,7 @@ class Statement:
     above: float = -math.inf
     below: float = math.inf
     paired: bool = True  # whether its entries have the same samples; otherwise the entries are independent
+    confounder: str = ""  # another cause that determines our entries, so that they cannot test the statement
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -193,6 +194,8 @@ def _explain_untested(
         return "; ".join(f"{row}: {reasons[row]}" for row in rows if row in reasons) or "no sample has all of these entries"
     if estimate.count < MIN_SAMPLES:
         return f"{estimate.count} samples; at least {MIN_SAMPLES} are needed"
+    if statement.confounder:
+        return statement.confounder
     return "; ".join(f"{row}: {no_evidence[row]}" for row in rows if row in no_evidence)
 
 

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import get_args
 
 from bench.api import Extractor
 from bench.core.errors import unknown_name
 from bench.datasets.gallery import Gallery
+from bench.datasets.hard_night import HardNight
 from bench.datasets.walk import Walk
 from bench.settings import Asset
+from bench.sfm.incremental_mapping import Mapper
+from bench.tasks.structure import Matching
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,15 +29,32 @@ class Profile:
     scale: float  # factor of each |K| of a table that varies it; its logarithm is added to each ε
     subspaces: int  # total number for Table S3
     other_releases: int  # maximum number for Table S4
-    gallery: Gallery  # default dataset of the localization tables
+    gallery: Gallery  # of figures of queries; by day, also of the localization tables
     gallery_scale: float  # `scale` of these tables
     trials: float  # RANSAC's trials, as a fraction of the paper's
     walk: Walk  # default dataset of the structure-from-motion table
     walk_scale: float  # `scale` of that table
     walk_keypoints: int  # maximum number per image for that table
     seeds: int  # number of seeds of that table
+    walk_variants: tuple[tuple[Mapper, Matching], ...] = (("global", "unique-words"),)  # of that table; claims rest on the first
+    walk_max_matched: int = 0  # largest m of that table whose words are matched by descriptors
     # Values of fields that save time, for attacks with these fields. All other fields have their tuned defaults.
     attack_overrides: Mapping[str, int] = field(default_factory=dict)
+
+    @property
+    def hard_night(self) -> HardNight:
+        """The default dataset of the localization tables: the gallery with a night that is hard to localize."""
+        gallery = self.gallery
+        return HardNight(
+            seed=gallery.seed,
+            views=gallery.views,
+            queries=gallery.queries,
+            night=gallery.night,
+            width=gallery.width,
+            height=gallery.height,
+            rooms=gallery.rooms,
+            detail=gallery.detail,
+        )
 
     @property
     def figure_gallery(self) -> Gallery:
@@ -56,6 +78,8 @@ SMOKE = Profile(
     walk_scale=1 / 256,
     walk_keypoints=1000,
     seeds=1,
+    walk_variants=(("global", "unique-words"), ("incremental", "descriptors")),
+    walk_max_matched=4,
     attack_overrides={"others": 8},
 )
 CPU = Profile(
@@ -74,6 +98,14 @@ CPU = Profile(
     walk_keypoints=2000,
     seeds=6,
 )
+# Table S2 with COLMAP's default limit of keypoints, both mappers, and matches that need not be unique.
+DENSE = dataclasses.replace(
+    CPU,
+    name="dense",
+    walk_keypoints=8192,
+    walk_variants=tuple(itertools.product(get_args(Mapper), get_args(Matching))),
+    walk_max_matched=4,
+)
 PAPER = Profile(
     name="paper",
     photographs=1_000_000,
@@ -89,8 +121,10 @@ PAPER = Profile(
     walk_scale=1.0,
     walk_keypoints=8192,
     seeds=6,
+    walk_variants=DENSE.walk_variants,
+    walk_max_matched=64,
 )
-PROFILES = {profile.name: profile for profile in (SMOKE, CPU, PAPER)}
+PROFILES = {profile.name: profile for profile in (SMOKE, CPU, DENSE, PAPER)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,6 +137,9 @@ class Materials:
     raw_network: Asset = Asset("shipped")
     affine_network: Asset = Asset("shipped")
     ldp_network: Asset = Asset("shipped")
+    # Networks with the paper's input: stacked origin and basis, or stacked words (`bench train --encoding released`).
+    as_printed_affine: Asset = Asset("shipped-as-printed")
+    as_printed_ldp: Asset = Asset("shipped-as-printed")
 
 
 @dataclass(frozen=True, kw_only=True)

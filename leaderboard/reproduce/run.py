@@ -28,6 +28,7 @@ from leaderboard.reproduce.claims import ClaimResult, TableEntry, judge_claims
 from leaderboard.reproduce.profiles import Profile, Setting
 from leaderboard.reproduce.study import Measure, Row, Table
 from leaderboard.signal import Signal, judge_experiments
+from leaderboard.tables import list_rejected
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -287,8 +288,8 @@ def _explain_missing(records: Sequence[Record]) -> str | None:
 
 
 def _summarize_notes(records: Sequence[Record]) -> str:
-    """Return the notes that all samples of a row share, and how many samples failed."""
+    """Return the notes that all samples of a row share, and how many samples failed or were rejected."""
     succeeded = [record for record in records if record["status"] == "ok"]
     common = [note for note in succeeded[0]["notes"] if all(note in record["notes"] for record in succeeded)]
     failed = len(records) - len(succeeded)
-    return "; ".join([*([f"{failed} failed"] if failed else []), *common])
+    return "; ".join([*([f"{failed} failed"] if failed else []), *list_rejected(succeeded), *common])

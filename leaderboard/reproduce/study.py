@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from bench.api import Attack, Dataset, Defense, Extractor, Plugin
+from bench.core.errors import UserError
 from bench.extractors.sift import Sift
 from bench.registry import discovery, fields, spec
 from bench.registry.discovery import Kind
@@ -15,7 +17,7 @@ from bench.task_api import Task
 from bench.tasks.reconstruction import Reconstruction
 from leaderboard.chance import IDENTIFIED, label_bits, label_identified, label_rank_1
 from leaderboard.reproduce.claims import Claim, TableEntry
-from leaderboard.reproduce.profiles import Profile, Setting
+from leaderboard.reproduce.profiles import Materials, Profile, Setting
 from leaderboard.signal import BASELINES
 
 if TYPE_CHECKING:
@@ -24,6 +26,12 @@ if TYPE_CHECKING:
     from leaderboard.reproduce.drawing import FigureData
 
 P = TypeVar("P", bound=Plugin)
+
+AS_PRINTED = "dia, as printed"
+AS_PRINTED_NOTE = (
+    f"The rows `{AS_PRINTED}` are not in the paper. Their network reads origin and basis, or the words in their released order, "
+    "stacked as the paper prints. Architecture, training and the mean over symmetries are those of `dia`."
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,6 +97,27 @@ def build_reconstruction(setting: Setting) -> Reconstruction:
     """Return the task of Tables 1 and 4: the network for raw descriptors inverts the recovered ones."""
     network = setting.materials.raw_network
     return Reconstruction() if network == Asset("shipped") else Reconstruction(inverter=f"dia:weights={network}")
+
+
+def build_row_as_printed(row: Row, network: Asset) -> Row:
+    """Return the row of the same release, attacked by a network that reads it as the paper prints, without the paper's values.
+
+    Raises
+    ------
+    UserError
+        if `network` is a file of a network that reads another input.
+    """
+    from bench.inversion import weights
+
+    if network != Materials.as_printed_ldp and (encoding := weights.load(Path(network)).meta["encoding"]) != "released":
+        raise UserError(f"{network}: its input is {encoding}; pass a network of `bench train --encoding released`")
+    return replace(
+        row,
+        name=f"{row.name}, as printed",
+        labels={**row.labels, "attack": AS_PRINTED},
+        paper={},
+        attack=build_plugin(discovery.ATTACK, "dia", {"weights": network}),
+    )
 
 
 def build_baseline_rows(task: Task) -> tuple[Row, ...]:

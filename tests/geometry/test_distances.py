@@ -6,7 +6,13 @@ import torch
 from subspace_cases import draw_subspaces, residual
 
 from bench.codebook.examples import draw_features
-from bench.geometry.distances import find_mutual_nearest, points_to_points, subspaces_to_points, subspaces_to_subspaces
+from bench.geometry.distances import (
+    find_mutual_nearest,
+    find_mutual_nearest_points,
+    points_to_points,
+    subspaces_to_points,
+    subspaces_to_subspaces,
+)
 from bench.geometry.nearest_words import unit_rows
 from bench.types import Floats
 
@@ -62,3 +68,20 @@ def test_empty_and_single_distances() -> None:
         rows, columns = find_mutual_nearest(torch.zeros(shape))
         assert len(rows) == len(columns) == 0
     assert find_mutual_nearest(torch.ones(1, 1), 0.8)[0].tolist() == [0]  # one column has no second
+
+
+def test_mutual_nearest_points_by_blocks_are_those_of_the_whole_matrix(rng: np.random.Generator) -> None:
+    """Repeated points make ties, also across blocks; the ratio test rejects a row whose nearest occurs twice."""
+    rows = rng.normal(size=(70, 16))
+    one, other = (
+        torch.from_numpy((each / np.linalg.norm(each, axis=1, keepdims=True)).astype(np.float32))
+        for each in (np.concatenate([rows[:40], rows[:10]]), np.concatenate([rows[20:], rows[20:30]]))
+    )
+    for ratio in (1.0, 0.8):
+        expected = find_mutual_nearest(points_to_points(one, other), ratio)
+        for step in (7, 50):
+            found = find_mutual_nearest_points(one, other, ratio, step)
+            for mine, theirs in zip(found, expected, strict=True):
+                np.testing.assert_array_equal(mine, theirs)
+        assert 0 < len(expected[0]) < 40
+    assert len(find_mutual_nearest_points(one[:0], other)[0]) == 0

@@ -16,6 +16,7 @@ from fakes import draw_texture
 from PIL import Image
 from scipy.stats import binomtest
 
+from attacks.dia import DIA
 from bench import cli
 from bench.api import Attack, Defense
 from bench.cache import store
@@ -24,6 +25,8 @@ from bench.core import progress
 from bench.core.table import Table as PrintedTable
 from bench.core.table import write_csv
 from bench.extractors.sift import Sift
+from bench.formats import tensor_file
+from bench.inversion import weights
 from bench.registry import discovery, spec
 from bench.runner import suite
 from bench.runner.records import FILE, Record
@@ -135,12 +138,55 @@ def find_unsupported_rows(setting: Setting) -> dict[str, str | None]:
     return {name: reason for name, reason in reasons.items() if reason is not None}
 
 
+def write_network_as_printed(folder: Path, defense: str, encoding: str = "released") -> Asset:
+    """Write the metadata of the shipped network for that defense with another encoding, and no weights."""
+    meta = weights.load(ASSETS / f"inversion-{defense}.safetensors").meta
+    path = folder / f"{defense}-{encoding}.safetensors"
+    tensor_file.save(path, weights.KIND, {"weight": np.zeros(1, np.float16)}, {**meta, "encoding": encoding})
+    return Asset(path)
+
+
 @pytest.mark.slow
-def test_shipped_files_support_every_row() -> None:
+def test_shipped_files_support_every_row(tmp_path: Path) -> None:
+    """A network with the input as printed need not be shipped. Its rows then state how to train it."""
     setting = Setting(profile=CPU, materials=Materials(), extractor=Sift(), photographs=7)
-    assert find_unsupported_rows(setting) == {}
-    another = Materials(ldp_network=Asset(str(ASSETS / "inversion-none.safetensors")))
+    printed = Materials(
+        as_printed_affine=write_network_as_printed(tmp_path, "affine"), as_printed_ldp=write_network_as_printed(tmp_path, "ldp")
+    )
+    assert find_unsupported_rows(replace(setting, materials=printed)) == {}
+    missing = find_unsupported_rows(setting)
+    assert len(missing) == (0 if list(ASSETS.glob("as-printed-*")) else 20)
+    assert all("as printed" in name for name in missing)
+    assert all("train one with `bench train --encoding released`" in str(reason) for reason in missing.values())
+    another = replace(printed, ldp_network=Asset(str(ASSETS / "inversion-none.safetensors")))
     assert len(find_unsupported_rows(replace(setting, materials=another))) == 16
+
+
+@pytest.mark.slow
+def test_rows_as_printed_stand_beside_ours(tmp_path: Path) -> None:
+    """Each has the release of one of our rows, a network of its own, and no value of the paper."""
+    materials = Materials(
+        as_printed_affine=write_network_as_printed(tmp_path, "affine"), as_printed_ldp=write_network_as_printed(tmp_path, "ldp")
+    )
+    setting = Setting(profile=CPU, materials=materials, extractor=Sift(), photographs=7)
+    for name, count, network in (("table1", 4, materials.as_printed_affine), ("table4", 16, materials.as_printed_ldp)):
+        rows = tables.load_tables()[name].build_rows(setting)
+        by_name = {row.name: row for row in rows}
+        printed = [row for row in rows if row.labels["attack"] == study.AS_PRINTED]
+        pairs = [(by_name[row.name.removesuffix(", as printed")], row) for row in printed]
+        assert len(pairs) == count
+        for ours, row in pairs:
+            assert (row.defense, row.task, row.paper) == (ours.defense, ours.task, {})
+            assert (ours.labels["attack"], row.attack) == ("dia", DIA(weights=network))
+            assert row.attack != ours.attack
+
+
+def test_a_network_with_another_input_is_no_network_as_printed(
+    images: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    network = write_network_as_printed(tmp_path, "affine", "invariant")
+    assert reproduce("table1", images, tmp_path / "out", "--as-printed-affine", network) == 2
+    assert f"{network}: its input is invariant; pass a network of `bench train --encoding released`" in capsys.readouterr().err
 
 
 @pytest.mark.slow
@@ -186,7 +232,7 @@ def test_interrupted_reproduction_resumes_with_the_same_result(
     ("words", "complaint"),
     [
         (("table7",), "unknown table 'table7'; did you mean"),
-        (("table1", "--profile", "big"), "unknown profile 'big'; available: cpu, paper, smoke"),
+        (("table1", "--profile", "big"), "unknown profile 'big'; available: cpu, dense, paper, smoke"),
         (("table4", "--profile", "paper"), "has 256,000 words, and profile paper needs 512,000"),
         (("tableS3", "--images", "nowhere"), "no such folder"),
         (("tableS3", "--database", "nowhere.safetensors"), "nowhere.safetensors"),

@@ -21,7 +21,7 @@ from bench.settings import Asset
 from bench.task_api import Outcome
 from bench.tasks.matching import ACCURACY_LIMITS, Matching, compute_accuracy, transfer
 from bench.testing import build_image
-from bench.types import Features, Release
+from bench.types import Features, Points, Release, WordSets
 from defenses.affine import Affine
 from defenses.ldp import LDP
 from defenses.naive_ldp import NaiveLDP
@@ -190,3 +190,34 @@ def test_invalid_settings_and_inputs_are_refused(tmp_path: Path) -> None:
         Matching().collect(tmp_path, None)
     with pytest.raises(UserError, match="give a folder of HPatches"):
         Matching().collect([tmp_path], None)
+
+
+def release_words(words: list[list[int]], dictionary: np.ndarray) -> WordSets:
+    rows = np.array(words)
+    points = Points(keypoints=np.zeros((len(rows), 2), np.float32))
+    return WordSets(positions=points, size=(9, 9), candidates=dictionary[rows], words=rows)
+
+
+def test_words_match_by_their_descriptors() -> None:
+    """Word 0 is shared and occurs twice, 1 and 2 are near each other, 3 is near nothing. Unique words miss the first two."""
+    dictionary = np.eye(6, 8, dtype=np.float32)
+    dictionary[2] = 0.8 * dictionary[1] + 0.6 * dictionary[5]
+    first, second = release_words([[0, 3], [1, 4]], dictionary), release_words([[0], [2], [0]], dictionary)
+    found = two_view_matching.match_by_word_descriptors(first, second, 0.8)
+    assert found.tolist() == [[0, 0], [0, 2], [1, 1]]
+    assert two_view_matching.match_releases(first, second).tolist() == [[0, 0], [0, 2]]
+    assert two_view_matching.match_releases(first, second, unique=True).tolist() == []
+    with pytest.raises(TypeError, match="needs words of a dictionary"):
+        two_view_matching.match_by_word_descriptors(replace(first, words=None), second)
+
+
+def test_words_that_both_images_release_match_by_descriptors_too(words: Asset, rng: np.random.Generator) -> None:
+    """With the ratio test, random releases match by little else than the words that both have."""
+    defense, public = LDP(dictionary=words, epsilon=0, subset_size=8), Public()
+    first, second = (defense.protect(SECRET, public, rng) for _ in range(2))
+    assert isinstance(first, WordSets)
+    assert isinstance(second, WordSets)
+    shared = {tuple(pair) for pair in two_view_matching.match_releases(first, second).tolist()}
+    by_descriptors = {tuple(pair) for pair in two_view_matching.match_by_word_descriptors(first, second, 0.8).tolist()}
+    assert len(shared) > 20
+    assert shared <= by_descriptors

@@ -287,6 +287,8 @@ def test_invalid_settings_and_inputs_are_refused(tmp_path: Path) -> None:
     for wrong in ({"views": 1}, {"others": 0}, {"start": 1.5}, {"views": 300, "others": 100}):
         with pytest.raises(UserError, match="walk: "):
             Walk(**wrong)
+    with pytest.raises(UserError, match="matching must be one of unique-words, words, descriptors, got sift"):
+        Structure(matching="sift")  # type: ignore[arg-type]
     with pytest.raises(UserError, match="takes a dataset and no images"):
         Structure().collect(tmp_path, None)
     with pytest.raises(UserError, match="2 queries; structure needs at least 3"):

@@ -22,7 +22,10 @@ REQUIRED = ("what",)
 def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("what", nargs="?", metavar="NAME", help="table1, table2, tableS2, figures, ...")
     parser.add_argument(
-        "--profile", metavar="NAME", default="cpu", help="smoke, cpu or paper: the size of the experiment (default: %(default)s)"
+        "--profile",
+        metavar="NAME",
+        default="cpu",
+        help="smoke, cpu, dense or paper: the size of the experiment (default: %(default)s)",
     )
     parser.add_argument("--images", type=Path, metavar="DIR", help="a folder of photographs (default: the built-in ones)")
     parser.add_argument("--dataset", metavar="SPEC", help="the scene, for tables about localization (default: a gallery)")
@@ -40,6 +43,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     for network, defense in (("raw", "none"), ("affine", "affine"), ("ldp", "ldp")):
         parser.add_argument(
             f"--{network}-network", metavar="FILE", help=f"network trained for `{defense}` (default: the shipped one)"
+        )
+    for defense, stacked in (("affine", "stacked origin and basis"), ("ldp", "stacked words")):
+        parser.add_argument(
+            f"--as-printed-{defense}",
+            metavar="FILE",
+            help=f"network trained for `{defense}` with the paper's input, {stacked} (default: the shipped one, if there is one)",
         )
 
 

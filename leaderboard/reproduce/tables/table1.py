@@ -11,6 +11,7 @@ from leaderboard.reproduce import published
 from leaderboard.reproduce.claims import Claim, Statement, TableEntry, at_least, falling, same_order
 from leaderboard.reproduce.profiles import Setting
 from leaderboard.reproduce.study import (
+    AS_PRINTED_NOTE,
     Measure,
     Row,
     Table,
@@ -18,6 +19,7 @@ from leaderboard.reproduce.study import (
     build_identification_measures,
     build_plugin,
     build_reconstruction,
+    build_row_as_printed,
 )
 
 PRINTED = ("mae", "ssim", "psnr")
@@ -51,7 +53,8 @@ def build_rows(setting: Setting) -> tuple[Row, ...]:
         )
         for line in lines[:-1]
     ]
-    return (undefended, *lifted)
+    direct = [row for row in lifted if row.labels["attack"] == "dia"]
+    return (undefended, *lifted, *(build_row_as_printed(row, materials.as_printed_affine) for row in direct))
 
 
 def build_reference_rows(setting: Setting) -> tuple[Row, ...]:
@@ -127,4 +130,5 @@ TABLE = Table(
     build_claims=build_claims,
     rank_measure="ssim",
     build_reference_rows=build_reference_rows,
+    notes=(AS_PRINTED_NOTE,),
 )

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from bench.api import Defense, Extractor
 from bench.extractors.sift import Sift
-from bench.registry import discovery
+from bench.tasks.structure import Structure
 from leaderboard.figures import Panel, draw
 from leaderboard.reproduce import published, scenes
 from leaderboard.reproduce.claims import Claim, Statement, TableEntry, falling, greater, same_order
@@ -20,7 +21,7 @@ from leaderboard.reproduce.drawing import FigureData
 from leaderboard.reproduce.profiles import Profile, Setting
 from leaderboard.reproduce.run import select_records
 from leaderboard.reproduce.scenes import ALL_DESCRIPTORS
-from leaderboard.reproduce.study import Measure, Row, Table, build_plugin
+from leaderboard.reproduce.study import Measure, Row, Table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -32,6 +33,8 @@ IMAGES = 128.0  # of South Building
 WORDS = "512000"
 SUBSETS = (4, 8, 16, 32, 64)
 BEST = 32
+RAW = "raw"
+SEPARATOR = "; "  # between the name of a row and its mapper and matching, if they are not the profile's first
 NEAR_BEST = 0.9  # a value above this fraction of the best counts as equal
 MIN_DIFFERENCE = 5000.0  # points of South Building
 PRINTED = {"registered": "registered_images", "points": "sparse_points"}  # our measure -> the paper's column
@@ -39,13 +42,17 @@ PRINTED |= {name: name for name in ("track_length", "reprojection_error")}
 
 
 def build_rows(setting: Setting) -> tuple[Row, ...]:
+    """Return the rows of the profile's first mapper and matching. The claims rest on them, except for the number of cameras."""
+    mapper, matching = setting.profile.walk_variants[0]
     lines = published.read_rows("tableS2_sfm")
     compared, others = ([line for line in lines if line["scene"] == scene] for scene in (COMPARED_SCENE, OTHER_SCENE))
-    task = build_plugin(discovery.TASK, "structure", {"images": setting.profile.walk.views})
+    task = Structure(images=setting.profile.walk.views, mapper=mapper, matching=matching)
     return tuple(
         Row(
             name=format_name(line["dictionary_size"], line["epsilon"], int(line["subset_size"])),
-            labels=build_labels(setting, line) | {OTHER_SCENE: " · ".join(other[column] for column in PRINTED.values())},
+            labels={"mapper": mapper, "matching": matching}
+            | build_labels(setting, line)
+            | {OTHER_SCENE: " · ".join(other[column] for column in PRINTED.values())},
             paper={"images": IMAGES} | {measure: float(line[column]) for measure, column in PRINTED.items()},
             defense=build_defense(setting, line["dictionary_size"], line["epsilon"], int(line["subset_size"])),
             attack=None,
@@ -53,6 +60,29 @@ def build_rows(setting: Setting) -> tuple[Row, ...]:
         )
         for line, other in zip(compared, others, strict=True)
     )
+
+
+def build_reference_rows(setting: Setting) -> tuple[Row, ...]:
+    """Return the rows of the other mappers and matchings. Raw descriptors have no words, so they have one row for each mapper."""
+    first, *others = setting.profile.walk_variants
+    mappers = {first[0]}
+    variants = []
+    for mapper, matching in others:
+        for row in build_rows(setting):
+            if row.name == RAW and mapper in mappers:
+                continue
+            if matching == "descriptors" and int(row.labels["m"]) > setting.profile.walk_max_matched:
+                continue
+            variants.append(
+                replace(
+                    row,
+                    name=f"{row.name}{SEPARATOR}{mapper}, {matching}",
+                    labels={**row.labels, "mapper": mapper, "matching": matching},
+                    task=Structure(images=setting.profile.walk.views, mapper=mapper, matching=matching),
+                )
+            )
+        mappers.add(mapper)
+    return tuple(variants)
 
 
 def build_labels(setting: Setting, line: Mapping[str, str]) -> dict[str, str]:
@@ -68,7 +98,7 @@ def build_defense(setting: Setting, size: str, epsilon: str, subset: int) -> Def
 def format_name(size: str, epsilon: str, subset: int) -> str:
     """Return the name of a row, by which claims refer to it."""
     if size == ALL_DESCRIPTORS:
-        return "raw"
+        return RAW
     return "no privacy" if epsilon == "inf" else f"m {subset}"
 
 
@@ -76,10 +106,16 @@ def build_claims(paper: Mapping[TableEntry, float]) -> tuple[Claim, ...]:
     def private(measure: str) -> list[TableEntry]:
         return [(f"m {subset}", measure) for subset in SUBSETS]
 
-    raw, quantised, best = ((row, "points") for row in ("raw", "no privacy", f"m {BEST}"))
+    raw, quantised, best = ((row, "points") for row in (RAW, "no privacy", f"m {BEST}"))
+    variants: dict[str, list[str]] = {}  # mapper and matching, "" for the profile's first -> names of rows
+    for row, measure in paper:
+        if measure == "images":
+            variants.setdefault(row.partition(SEPARATOR)[2], []).append(row)
     return (
         same_order(
-            {entry: value for entry, value in paper.items() if entry[1] == "points"}, MIN_DIFFERENCE, "points of South Building"
+            {entry: value for entry, value in paper.items() if entry[1] == "points" and SEPARATOR not in entry[0]},
+            MIN_DIFFERENCE,
+            "points of South Building",
         ),
         Claim(text="Quantisation alone, without privacy, loses points.", statements=(greater(raw, quantised),)),
         Claim(
@@ -93,9 +129,12 @@ def build_claims(paper: Mapping[TableEntry, float]) -> tuple[Claim, ...]:
                 *(state_near_best(best, entry) for entry in private("points")[2:] if entry != best),
             ),
         ),
-        Claim(
-            text="Most cameras are registered in every row: more than half.",
-            statements=tuple(state_most_registered(row) for row, measure in paper if measure == "images"),
+        *(
+            Claim(
+                text=f"Most cameras are registered in every row{f' of {variant}' if variant else ''}: more than half.",
+                statements=tuple(state_most_registered(row) for row in rows),
+            )
+            for variant, rows in variants.items()
         ),
         Claim(
             text="Tracks get shorter: raw descriptors have the longest, and every m shorter ones than quantisation alone.",
@@ -138,9 +177,10 @@ PANEL_METRICS = {"registered": "registered", "right": "right_poses", "points": "
 
 def draw_figures(data: FigureData) -> Iterator[tuple[str, Figure]]:
     """Yield a figure with an image of the scene, and with the models of the first seed seen from above."""
-    sample = next(record["sample"] for row in data.result.rows for record in select_records(data.result, row.name))
+    rows = build_rows(data.setting)
+    sample = next(record["sample"] for row in rows for record in select_records(data.result, row.name))
     panels = [Panel(original, name, "") for name, original in itertools.islice(data.load_originals(), 1)]
-    panels += [data.build_panel(row.name, sample, row.name, PANEL_METRICS, digits=0) for row in data.result.rows]
+    panels += [data.build_panel(row.name, sample, row.name, PANEL_METRICS, digits=0) for row in rows]
     yield "models", draw(panels, f"Structure from motion of {sample} from above; red wedges show viewing directions", 4)
 
 
@@ -158,6 +198,7 @@ TABLE = Table(
     },
     build_rows=build_rows,
     build_claims=build_claims,
+    build_reference_rows=build_reference_rows,
     dataset=select_walk,
     extractor=build_extractor,
     multiple_seeds=True,
@@ -169,6 +210,9 @@ TABLE = Table(
         "Right poses are images within 5% of the scene's extent and 5° of their true poses, up to one similarity.",
         "Where |K| is scaled by s, ε is shifted by ln s: the chance that the true word is released stays the paper's, the "
         "guarantee is that of our ε. The dictionary is from images of the scene that are not mapped.",
+        "Matching: unique-words, by words that are unique in both images; words, by all words that both images release; "
+        "descriptors, by words with mutually nearest descriptors. `--profile dense` has up to 8,192 keypoints per "
+        "image, both mappers and all matchings, descriptors up to m = 4.",
         "Intervals are over seeds, of releases and of mapping, in this one scene; n counts the seeds with a model.",
     ),
 )
