@@ -16,7 +16,8 @@ import numpy as np
 from bench.api import Attack, ImageAttack
 from bench.cache.attack_cache import recover_cached
 from bench.core.errors import SampleError, UserError
-from bench.formats.stored_features import map_out_of_square, read_upright_size
+from bench.formats.stored_features import encode_name, map_out_of_square, read_upright_size
+from bench.images.photographs import Source
 from bench.task_api import Trial
 from bench.tasks.reconstruction import build_view
 from bench.types import Bytes, Descriptors, Floats, WordSets
@@ -43,8 +44,9 @@ def collect_features(trial: Trial, path: Path, attack: Attack | None) -> ImageFe
     Raises
     ------
     SampleError
-        if there are no descriptors, or the photograph has an EXIF rotation.
+        if there are no descriptors, the photograph has an EXIF rotation, or its name is not UTF-8, as other programs need it.
     """
+    encode_name(trial.sample.name)
     release = trial.release
     if isinstance(attack, ImageAttack):
         raise SampleError(f"{attack.name()} does not recover descriptors")
@@ -58,7 +60,7 @@ def collect_features(trial: Trial, path: Path, attack: Attack | None) -> ImageFe
         rows = release.candidates.reshape(len(keypoints), -1)  # (N m, D)
     else:
         raise SampleError(f"a release of {type(release).__name__} has no descriptors; give --attack to export recovered ones")
-    size = read_upright_size(path)
+    size = read_upright_size(Source(trial.sample.name, path))
     moved = map_out_of_square(keypoints.astype(np.float64), size, release.size[0]).astype(np.float32)
     return ImageFeatures(name=trial.sample.name, path=path, size=size, keypoints=moved, descriptors=rows)
 
