@@ -3,8 +3,8 @@
 COLMAP puts the centre of the first pixel at (0.5, 0.5), as we do. Its descriptors have 8 bits. The name of an image in the
 database is its path below COLMAP's image folder, and must be the path below ours.
 
-The file is opened by SQLite itself, read-only. pycolmap would migrate a database of COLMAP 3 in place, and needs a folder that can
-be written. Tables: https://colmap.github.io/database.html; the column `type` of `descriptors` is of COLMAP 4.
+The file is opened by SQLite itself, read-only. pycolmap would migrate a database of COLMAP 3 in place, and needs a folder that
+can be written. Tables: https://colmap.github.io/database.html; COLMAP 4 has added the column `type` of `descriptors`.
 """
 
 from __future__ import annotations
@@ -81,11 +81,11 @@ class ColmapDatabase(Extractor):
                 keypoints = _read_matrix(database, "keypoints", number, np.dtype("<f4"), where)
                 _check_type(database, number, where)
                 codes = _read_matrix(database, "descriptors", number, np.dtype("u1"), where)
-        except sqlite3.Error as error:
+        except (sqlite3.Error, UnicodeError) as error:  # a message with a damaged name is not UTF-8
             raise SampleError(f"{where} is damaged, or no database of COLMAP: {error}") from error
         if keypoints.shape[1] < 2 or codes.shape[1] != SIFT or len(keypoints) != len(codes):
             raise SampleError(
-                f"{where}: keypoints have shape {keypoints.shape}, and descriptors {codes.shape}; {SIFT} bytes are SIFT"
+                f"{where}: keypoints have shape {keypoints.shape} and descriptors {codes.shape}, expected (N, 2) and (N, {SIFT})"
             )
         if not all(isinstance(extent, int) and 0 < extent < 2**31 for extent in size):
             raise SampleError(f"{where}: the image has no camera with a width and a height")
@@ -121,7 +121,7 @@ def _check_type(database: sqlite3.Connection, number: int, where: str) -> None:
     found = database.execute("SELECT type FROM descriptors WHERE image_id = ?", (number,)).fetchone()
     if found is not None and found[0] != SIFT_TYPE:
         raise SampleError(
-            f"{where}: its descriptors are {_name_type(found[0])}, and only SIFT is read; export others to hloc's HDF5"
+            f"{where}: its descriptors are {_name_type(found[0])}, and only SIFT is read; the extractor hloc reads others"
         )
 
 

@@ -1,8 +1,8 @@
 """Features that hloc extracted (Sarlin et al., CVPR 2019), read from an HDF5 file with a group for each image.
 
-The name of a group is the image's path below hloc's image folder, and must be the path below ours. A group holds `keypoints` (N, 2), `descriptors` (D, N) and
-`image_size` (width, height). hloc puts the centre of the first pixel at (0, 0), so half a pixel is added. hloc ignores EXIF
-rotation, so a photograph with an EXIF rotation is refused.
+The name of a group is the image's path below hloc's image folder, and must be the path below ours. A group holds `keypoints`
+(N, 2), `descriptors` (D, N) and `image_size` (width, height). hloc puts the centre of the first pixel at (0, 0), so half a pixel
+is added. hloc ignores EXIF rotation, so a photograph with an EXIF rotation is refused.
 """
 
 from __future__ import annotations

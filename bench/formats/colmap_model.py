@@ -1,7 +1,7 @@
 """Cameras and poses of COLMAP's sparse models, as text or binary.
 
-Format: https://colmap.github.io/format.html. Points are not read: maps are triangulated again. The poses of images are complete, so
-the rigs and frames of COLMAP 4 are not needed either.
+Format: https://colmap.github.io/format.html. Points are not read: maps are triangulated again. The poses of images are complete,
+so the rigs and frames of COLMAP 4 are not needed either.
 
 pycolmap's reader is not used. It drops images of a text file without lines of points, cuts names at spaces, needs minutes for a
 damaged count of points, and raises errors without a file and a line. It is the reference of the tests.

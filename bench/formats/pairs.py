@@ -21,8 +21,8 @@ def read(path: Path) -> dict[str, list[str]]:
     for number, fields in lists.read_fields(path):
         if len(fields) != 2:
             raise UserError(
-                f"{path}:{number}: a pair is two names, 'query reference', but there are {len(fields)} fields; hloc's lists cannot "
-                "hold names with spaces"
+                f"{path}:{number}: a pair is two names, 'query reference', but there are {len(fields)} fields; names with spaces "
+                "cannot be in such a list"
             )
         query, reference = fields
         references = pairs.setdefault(query, [])

@@ -27,7 +27,7 @@ def map_out_of_square(xy: np.ndarray, size: tuple[int, int], side: int) -> np.nd
 
 
 def encode_name(name: str) -> bytes:
-    """Return a photograph's name in UTF-8; raise SampleError if its file's name is none, since other programs would not find it."""
+    """Return a photograph's name in UTF-8, as other programs store it; raise SampleError if the file's name is not UTF-8."""
     try:
         return name.encode()
     except UnicodeEncodeError:

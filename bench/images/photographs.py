@@ -1,8 +1,8 @@
 """Photographs as 256 x 256 RGB images, all converted by one rule.
 
 The rule: EXIF rotation is applied. Transparency is composited over white. A single channel is repeated three times. 16 bits are
-scaled to 8. The first page of a TIFF file is read. The largest centred square is cropped and resized with Pillow's bicubic filter,
-which averages if it shrinks.
+scaled to 8. The first page of a TIFF file is read. The largest centred square is cropped and resized with Pillow's bicubic
+filter, which averages if it shrinks.
 """
 
 from __future__ import annotations

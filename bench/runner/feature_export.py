@@ -77,7 +77,13 @@ def write_hloc(images: Sequence[ImageFeatures], out: Path) -> None:
 
 
 def write_colmap(images: Sequence[ImageFeatures], out: Path) -> None:
-    """Write a database in the format of COLMAP's feature extractor, with cameras that COLMAP reads from the images."""
+    """Write a database in the format of COLMAP's feature extractor, with cameras that COLMAP reads from the images.
+
+    Raises
+    ------
+    UserError
+        if COLMAP cannot read one of the images; no file is left.
+    """
     import pycolmap
 
     root = _find_root(images)
@@ -86,14 +92,16 @@ def write_colmap(images: Sequence[ImageFeatures], out: Path) -> None:
     names = [image.name for image in images]
     pycolmap.import_images(out, root, camera_mode=pycolmap.CameraMode.PER_IMAGE, image_names=names)
     with pycolmap.Database.open(out) as database:
-        for image in images:
-            row = database.read_image_with_name(image.name)
-            assert row is not None
-            number = row.image_id
-            database.write_keypoints(number, image.keypoints)
+        numbers = {row.name: row.image_id for row in database.read_all_images()}
+        unread = [name for name in names if name not in numbers]
+        for image in images if not unread else ():
+            database.write_keypoints(numbers[image.name], image.keypoints)
             kinds = pycolmap.FeatureExtractorType
             kind = kinds.SIFT if image.descriptors.shape[1] == SIFT else kinds.UNDEFINED
-            database.write_descriptors(number, pycolmap.FeatureDescriptors(kind, _quantise(image.descriptors)))
+            database.write_descriptors(numbers[image.name], pycolmap.FeatureDescriptors(kind, _quantise(image.descriptors)))
+    if unread:
+        out.unlink()
+        raise UserError(f"{unread[0]}: COLMAP cannot read this image; convert it to PNG or JPEG, or give --layout hloc")
 
 
 LAYOUTS: Mapping[str, Callable[[Sequence[ImageFeatures], Path], None]] = {"hloc": write_hloc, "colmap": write_colmap}

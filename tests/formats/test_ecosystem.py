@@ -22,6 +22,7 @@ from bench.extractors.sift import Sift
 from bench.formats import pairs as hloc_pairs
 from bench.formats.stored_features import map_into_square, map_out_of_square
 from bench.images import photographs
+from bench.images.photographs import Source
 from bench.testing import check_extractor
 
 kornia = pytest.importorskip("kornia")
@@ -58,7 +59,7 @@ def test_features_exported_to_hloc_are_read_again(images: Path, tmp_path: Path) 
     assert export("--images", images, "--layout", "hloc", "--out", out, "--pairs", pairs) == 0
     path = images / "street" / "a.png"
     pixels = photographs.read(path).pixels
-    ours, back = Sift().extract(pixels), Hloc(path=out).extract(pixels, path)
+    ours, back = Sift().extract(pixels), Hloc(path=out).extract(pixels, Source("street/a.png", path))
     np.testing.assert_allclose(back.keypoints, ours.keypoints, atol=1e-3)
     np.testing.assert_allclose(back.descriptors, ours.descriptors, atol=1e-6)
     with h5py.File(out) as opened:
@@ -121,12 +122,12 @@ def test_exported_database_is_read_by_colmap_and_by_us(images: Path, tmp_path: P
         assert database.num_frames() == database.num_images() == 2  # as its incremental mapper wants them
     assert (camera.width, camera.height) == (300, 200)
     np.testing.assert_allclose(xy[:, :2], ours.keypoints * (200 / 256) + [50, 0], atol=1e-3)
-    back = ColmapDatabase(path=out).extract(pixels, path)
+    back = ColmapDatabase(path=out).extract(pixels, Source("street/a.png", path))
     np.testing.assert_allclose(back.keypoints, ours.keypoints, atol=1e-3)
     assert back.codes is not None
     assert ours.codes is not None
     np.testing.assert_allclose(back.codes.astype(int), ours.codes.astype(int), atol=2)  # SIFT's norm is 512 but for rounding
-    check_extractor(ColmapDatabase(path=out), pixels, path)
+    check_extractor(ColmapDatabase(path=out), pixels, Source("street/a.png", path))
 
 
 def test_features_of_colmap_are_read(tmp_path: Path) -> None:
@@ -136,7 +137,7 @@ def test_features_of_colmap_are_read(tmp_path: Path) -> None:
     out = tmp_path / "database.db"
     pycolmap.extract_features(out, root, device=pycolmap.Device.cpu)
     path = root / "0.png"
-    found = ColmapDatabase(path=out).extract(photographs.read(path).pixels, path)
+    found = ColmapDatabase(path=out).extract(photographs.read(path).pixels, Source("0.png", path))
     with pycolmap.Database.open(out) as database:
         image = database.read_image_with_name("0.png")
         assert len(found) == database.num_keypoints_for_image(image.image_id)
@@ -154,10 +155,10 @@ def test_unusable_databases(images: Path, tmp_path: Path) -> None:
     unrelated = tmp_path / "unrelated.png"
     draw_texture(9, (300, 200)).save(unrelated)
     with pytest.raises(SampleError, match="no image of that name"):
-        ColmapDatabase(path=out).extract(photographs.read(unrelated).pixels, unrelated)
+        ColmapDatabase(path=out).extract(photographs.read(unrelated).pixels, Source("unrelated.png", unrelated))
     draw_texture(9, (100, 200)).save(images / "b.png")
     with pytest.raises(SampleError, match="the photograph has"):
-        ColmapDatabase(path=out).extract(photographs.read(images / "b.png").pixels, images / "b.png")
+        ColmapDatabase(path=out).extract(photographs.read(images / "b.png").pixels, Source("b.png", images / "b.png"))
     with pytest.raises(UserError, match="this image has none"):
         ColmapDatabase(path=out).extract(np.zeros((256, 256, 3), np.uint8))
 

@@ -57,6 +57,10 @@ def execute(args: argparse.Namespace) -> int:
         seed=args.seed,
     )
     plan = build_plan(configuration)
+    if args.pairs is not None:
+        if args.pairs.absolute() == args.out.absolute():
+            raise UserError(f"--pairs {args.pairs}: the same file as --out; give another")
+        pairs.check_names(sample.name for sample in plan.samples)
     (experiment,) = plan.experiments
     if attack is not None and experiment.reason is not None:
         raise UserError(experiment.reason)
