@@ -11,6 +11,7 @@ import hashlib
 import importlib.util
 import logging
 import re
+import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -252,7 +253,8 @@ def read_orientation(image: Image.Image) -> int:
     Only this tag is read, since the others may be damaged without harm to the picture.
     """
     try:
-        orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
+        with warnings.catch_warnings(action="ignore"):  # of corrupt EXIF data
+            orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
         return int(orientation) if orientation in UPRIGHT else 1
     except Exception:  # as in `decode`: damaged EXIF data raise errors of any class
         return 1
