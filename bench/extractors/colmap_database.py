@@ -21,7 +21,7 @@ import numpy as np
 
 from bench.api import Extractor
 from bench.core.errors import SampleError, UserError
-from bench.formats.stored_features import NAMES_HINT, encode_name, map_into_square, read_upright_size
+from bench.formats.stored_features import NAMES_HINT, check_name, map_into_square, read_upright_size
 from bench.geometry.nearest_words import unit_rows
 from bench.images.photographs import Source
 from bench.types import Bytes, Features
@@ -71,10 +71,11 @@ class ColmapDatabase(Extractor):
 
     def _read(self, source: Source) -> tuple[np.ndarray, Bytes, tuple[int, int]]:
         """Read the features of a photograph. -> keypoints (N, 2), codes (N, 128), and the (width, height) of the image"""
+        check_name(source.name)
         where = f"{source.name}: {self.path}"
         try:
             with _open(self.path) as database:
-                found = database.execute(FIND_IMAGE, (encode_name(source.name).decode(),)).fetchone()
+                found = database.execute(FIND_IMAGE, (source.name,)).fetchone()
                 if found is None:
                     raise SampleError(f"{where} has no image of that name; {NAMES_HINT}")
                 number, *size = found

@@ -15,7 +15,7 @@ import numpy as np
 
 from bench.api import Extractor
 from bench.core.errors import SampleError, UserError
-from bench.formats.stored_features import NAMES_HINT, encode_name, map_into_square, read_upright_size
+from bench.formats.stored_features import NAMES_HINT, check_name, map_into_square, read_upright_size
 from bench.geometry.nearest_words import unit_rows
 from bench.images.photographs import Source
 from bench.types import Features
@@ -67,10 +67,11 @@ class Hloc(Extractor):
         """Read and check the group. -> keypoints (N, 2) float64, descriptors (N, D), and the (width, height) of the image"""
         import h5py
 
-        name, where = encode_name(source.name), f"{source.name}: {self.path}"
+        check_name(source.name)
+        where = f"{source.name}: {self.path}"
         try:
             with h5py.File(self.path) as opened:
-                group = opened.get(name)
+                group = opened.get(source.name)
                 if not isinstance(group, h5py.Group):
                     raise SampleError(f"{where} has no features of that name; {NAMES_HINT}")
                 keypoints = _read_array(group, "keypoints", 2, where)

@@ -114,11 +114,20 @@ def split_name(text: str, count: int) -> tuple[str, list[str]]:
     return name, fields
 
 
+def is_utf8(name: str) -> bool:
+    """Return whether a file name can be written as UTF-8. Python replaces the bytes of other names by surrogates."""
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
 def check_names(names: Iterable[str]) -> None:
     """Raise UserError for a name that a list of intrinsics or poses cannot hold, so that it would be read as another one."""
     for name in names:
-        line_breaks = len(name.splitlines()) != 1
-        if line_breaks or name.startswith("#") or split_name(f"{name} 1", 1) != (name, ["1"]) or name != name.strip():
+        is_line = name.splitlines() == [name.strip()] and is_utf8(name)
+        if not is_line or name.startswith("#") or split_name(f"{name} 1", 1) != (name, ["1"]):
             raise UserError(f"{name!r}: a list of images cannot hold this name; rename the image")
 
 

@@ -50,10 +50,12 @@ def write(path: Path, pairs: Mapping[str, Sequence[str]]) -> int:
 
 
 def check_names(names: Iterable[str]) -> None:
-    """Raise UserError for a name that the file cannot hold: one with a space, or one that would begin a comment."""
+    """Raise UserError for a name that the file cannot hold: with a space, of a comment, or not in UTF-8."""
     for name in sorted(names):
-        if len(name.split()) != 1 or name.startswith("#") or not name.isprintable():
-            raise UserError(f"{name!r}: a list of pairs cannot hold a name with a space in it, or one that begins with #")
+        if len(name.split()) != 1:
+            raise UserError(f"{name!r}: a list of pairs cannot hold a name with a space in it")
+        if name.startswith("#") or not lists.is_utf8(name):
+            raise UserError(f"{name!r}: a list of pairs cannot hold a name that begins with #, or is not UTF-8")
 
 
 def pair_all(names: Sequence[str]) -> dict[str, Sequence[str]]:

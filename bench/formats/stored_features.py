@@ -10,6 +10,7 @@ import numpy as np
 from PIL import Image
 
 from bench.core.errors import SampleError
+from bench.formats import lists
 from bench.images.photographs import Source, read_orientation
 
 NAMES_HINT = "names are paths below the image folder: give the folder that the features were extracted from"
@@ -26,12 +27,10 @@ def map_out_of_square(xy: np.ndarray, size: tuple[int, int], side: int) -> np.nd
     return xy * (min(size) / side) + _find_corner(size)
 
 
-def encode_name(name: str) -> bytes:
-    """Return a photograph's name in UTF-8, as other programs store it; raise SampleError if the file's name is not UTF-8."""
-    try:
-        return name.encode()
-    except UnicodeEncodeError:
-        raise SampleError(f"{name!a}: this name is not UTF-8; rename the file") from None
+def check_name(name: str) -> None:
+    """Raise SampleError if a photograph's name is not UTF-8, in which other programs store names."""
+    if not lists.is_utf8(name):
+        raise SampleError(f"{name!a}: this name is not UTF-8; rename the file")
 
 
 def read_upright_size(source: Source, size: tuple[int, int] | None = None) -> tuple[int, int]:

@@ -16,7 +16,7 @@ import numpy as np
 from bench.api import Attack, ImageAttack
 from bench.cache.attack_cache import recover_cached
 from bench.core.errors import SampleError, UserError
-from bench.formats.stored_features import encode_name, map_out_of_square, read_upright_size
+from bench.formats.stored_features import check_name, map_out_of_square, read_upright_size
 from bench.images.photographs import Source
 from bench.task_api import Trial
 from bench.tasks.reconstruction import build_view
@@ -46,7 +46,7 @@ def collect_features(trial: Trial, path: Path, attack: Attack | None) -> ImageFe
     SampleError
         if there are no descriptors, the photograph has an EXIF rotation, or its name is not UTF-8, as other programs need it.
     """
-    encode_name(trial.sample.name)
+    check_name(trial.sample.name)
     release = trial.release
     if isinstance(attack, ImageAttack):
         raise SampleError(f"{attack.name()} does not recover descriptors")

@@ -1,6 +1,7 @@
 """Exchange with hloc, COLMAP, kornia and TensorBoard; the folders of MegaDepth and HPatches."""
 
 import builtins
+import os
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 import torch
 from fakes import draw_texture, write_album
 from PIL import Image
+from PIL import features as image_features
 
 from bench import cli
 from bench.codebook.examples import write_dictionary
@@ -104,6 +106,56 @@ def test_invalid_arguments_of_export(images: Path, tmp_path: Path, capfd: pytest
         assert export("--images", images, *arguments) == 2
         assert complaint in capfd.readouterr().err
     assert not (tmp_path / "x").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("layout", ["hloc", "colmap"])
+def test_pairs_are_refused_before_anything_is_written(
+    images: Path, tmp_path: Path, layout: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    out, pairs = tmp_path / "out", tmp_path / "pairs.txt"
+    (images / "b.png").rename(images / "b c.png")
+    assert export("--images", images, "--layout", layout, "--out", out, "--pairs", pairs) == 2
+    assert "'b c.png': a list of pairs cannot hold a name with a space in it" in capfd.readouterr().err
+    assert export("--images", images, "--layout", layout, "--out", out, "--pairs", out) == 2
+    assert "the same file as --out" in capfd.readouterr().err
+    assert not out.exists()
+    assert not pairs.exists()
+    assert export("--images", images, "--layout", layout, "--out", out) == 0  # without a list the name is allowed
+    path = images / "b c.png"
+    back = (Hloc if layout == "hloc" else ColmapDatabase)(path=out).extract(
+        photographs.read(path).pixels, Source("b c.png", path)
+    )
+    assert len(back) == len(Sift().extract(photographs.read(path).pixels))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("layout", ["hloc", "colmap"])
+def test_names_that_are_not_utf8_fail_alone(images: Path, tmp_path: Path, layout: str, capfd: pytest.CaptureFixture[str]) -> None:
+    (images / "b.png").rename(Path(os.fsdecode(os.fsencode(images) + b"/caf\xe9.png")))
+    out, pairs = tmp_path / "out", tmp_path / "pairs.txt"
+    assert export("--images", images, "--layout", layout, "--out", out, "--pairs", pairs) == 1
+    assert r"'caf\udce9.png': this name is not UTF-8; rename the file" in capfd.readouterr().err
+    path = images / "street" / "a.png"
+    back = (Hloc if layout == "hloc" else ColmapDatabase)(path=out).extract(
+        photographs.read(path).pixels, Source("street/a.png", path)
+    )
+    assert len(back) == len(Sift().extract(photographs.read(path).pixels))
+    with pytest.raises(SampleError, match="this name is not UTF-8"):
+        (Hloc if layout == "hloc" else ColmapDatabase)(path=out).extract(
+            photographs.read(path).pixels, Source("caf\udce9.png", path)
+        )
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not image_features.check("avif"), reason="this Pillow cannot write AVIF")
+def test_images_that_colmap_cannot_read_leave_no_database(
+    images: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    draw_texture(0, (300, 200)).save(images / "c.avif")
+    assert export("--images", images, "--layout", "colmap", "--out", tmp_path / "out.db") == 2
+    assert "c.avif: COLMAP cannot read this image; convert it to PNG or JPEG" in capfd.readouterr().err
+    assert list(tmp_path.iterdir()) == [images]
 
 
 # ---- COLMAP

@@ -37,7 +37,7 @@ def test_names_are_read_as_written(tmp_path: Path, name: str) -> None:
     assert [*lists.read_intrinsics(tmp_path / "a"), *lists.read_poses(tmp_path / "b"), *nvm.read(tmp_path / "c")] == [name] * 3
 
 
-@pytest.mark.parametrize("name", ["", "#1.png", "a\n1.png", " a.png", "a.png ", "a 1", "a\u2028b"])
+@pytest.mark.parametrize("name", ["", "#1.png", "a\n1.png", " a.png", "a.png ", "a 1", "a\u2028b", "caf\udce9.png"])
 def test_names_that_would_be_read_otherwise_are_not_written(tmp_path: Path, name: str) -> None:
     pose = pycolmap.Rigid3d()
     for write in (
