@@ -14,6 +14,7 @@ import re
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -84,11 +85,17 @@ def list_photographs(directory: Path) -> list[Source]:
         raise UserError(f"--images {directory}: no such folder")
     files, left_out = _find_files(directory)
     if left_out:
-        logging.getLogger(__name__).warning("--images %s: left out: %s", directory, _describe(left_out, directory))
+        _log_once(f"--images {directory}: left out: {_describe(left_out, directory)}")
     files = [path for path in files if path.parent.name == "imgs" and MEGADEPTH.fullmatch(path.parents[1].name)] or files
     if not files:
         raise UserError(f"--images {directory}: no photograph in it (looked for {', '.join(sorted(SUFFIXES))})")
     return [Source(path.relative_to(directory).as_posix(), path) for path in files]
+
+
+@cache
+def _log_once(line: str) -> None:
+    """Log a line unless this process has: a run lists its folder several times."""
+    logging.getLogger(__name__).warning(line)
 
 
 def _find_files(directory: Path) -> tuple[list[Path], dict[str, list[Path]]]:
