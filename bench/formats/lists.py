@@ -239,8 +239,8 @@ def _read_entries(
 def _split_camera(text: str) -> tuple[str, list[str]]:
     """Split `name MODEL width height params`. The last word that names a model ends the name, since numbers follow it."""
     words, models = text.split(), _list_camera_models()
-    places = [place for place, word in enumerate(words) if place > 0 and word in models]
-    count = len(words) - (places[-1] if places else 1)
+    indices = [index for index, word in enumerate(words) if index > 0 and word in models]
+    count = len(words) - (indices[-1] if indices else 1)
     name, *fields = text.rsplit(maxsplit=count) if count else [text]
     return name, fields
 

@@ -201,7 +201,7 @@ def test_invalid_features_are_explained(tmp_path: Path, photograph: Path, datase
 
 
 @pytest.mark.parametrize("part", ["keypoints", "descriptors", "image_size"])
-def test_groups_in_place_of_arrays_are_explained(tmp_path: Path, photograph: Path, part: str) -> None:
+def test_groups_instead_of_arrays_are_explained(tmp_path: Path, photograph: Path, part: str) -> None:
     path = features(tmp_path, **{part: None})
     with h5py.File(path, "a") as opened:
         opened.create_group(f"street/a.png/{part}")
@@ -209,7 +209,7 @@ def test_groups_in_place_of_arrays_are_explained(tmp_path: Path, photograph: Pat
         extract(path, photograph)
 
 
-def test_array_in_place_of_a_group_is_explained(tmp_path: Path, photograph: Path) -> None:
+def test_array_instead_of_a_group_is_explained(tmp_path: Path, photograph: Path) -> None:
     with h5py.File(tmp_path / "features.h5", "w") as opened:
         opened["street/a.png"] = np.ones(3)
     with pytest.raises(SampleError, match="has no features of that name"):

@@ -38,8 +38,8 @@ EDITS = st.lists(
 
 def damage(content: bytes, edits: list[tuple[float, int, bytes]], cut: float) -> bytes:
     """Replace `length` bytes at each position by others, and cut the end off. Positions are fractions of the file."""
-    for place, length, replacement in edits:
-        start = round(place * len(content))
+    for position, length, replacement in edits:
+        start = round(position * len(content))
         content = content[:start] + replacement + content[start + length :]
     return content[: round(cut * len(content))]
 
@@ -122,10 +122,10 @@ def test_accepted_binary_images_equal_those_of_pycolmap(folder: Path) -> None:
     whole, compared = path.read_bytes(), []
 
     @few
-    @given(place=st.integers(0, len(whole) - 1), bit=st.integers(0, 7))
-    def check(place: int, bit: int) -> None:
+    @given(position=st.integers(0, len(whole) - 1), bit=st.integers(0, 7))
+    def check(position: int, bit: int) -> None:
         content = bytearray(whole)
-        content[place] ^= 1 << bit
+        content[position] ^= 1 << bit
         path.write_bytes(content)
         found = read_or_explain(partial(colmap_model.read, path.parent), path)
         if not isinstance(found, dict):
@@ -136,7 +136,7 @@ def test_accepted_binary_images_equal_those_of_pycolmap(folder: Path) -> None:
             np.testing.assert_allclose(pose.translation, reference[name].cam_from_world().translation, rtol=0, atol=0)
             np.testing.assert_allclose(pose.matrix(), reference[name].cam_from_world().matrix(), atol=1e-2)
             assert np.array_equal(camera.params, reference[name].camera.params)
-        compared.append(place)
+        compared.append(position)
 
     check()
     assert len(compared) > 10
