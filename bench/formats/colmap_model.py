@@ -47,11 +47,9 @@ def read(folder: Path) -> dict[str, PosedImage]:
         if the model is damaged or contains no image; the message names the file and the line or the image.
     """
     if _holds(folder, "bin"):
-        cameras = dict(_read_binary_cameras(folder / "cameras.bin"))
-        images = _read_binary_images(folder / "images.bin", cameras)
+        images = _read_binary_images(folder / "images.bin", _read_binary_cameras(folder / "cameras.bin"))
     else:
-        cameras = _read_text_cameras(folder / "cameras.txt")
-        images = _read_text_images(folder / "images.txt", cameras)
+        images = _read_text_images(folder / "images.txt", _read_text_cameras(folder / "cameras.txt"))
     posed: dict[str, PosedImage] = {}
     for name, image in images:
         if name in posed:
