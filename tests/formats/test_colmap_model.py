@@ -55,7 +55,8 @@ def edit(path: Path, change: Callable[[str], str]) -> None:
 def test_cameras_and_poses_equal_those_of_pycolmap_bit_by_bit(form: str, request: pytest.FixtureRequest) -> None:
     folder = request.getfixturevalue(form)
     found = colmap_model.read(folder)
-    reference = {image.name: image for image in pycolmap.Reconstruction(folder).images.values()}
+    model = pycolmap.Reconstruction(folder)  # its images refer to it
+    reference = {image.name: image for image in model.images.values()}
     assert found.keys() == reference.keys() == set(NAMES)
     for name, (where, camera, pose) in found.items():
         assert np.array_equal(pose.matrix(), reference[name].cam_from_world().matrix())
@@ -118,7 +119,7 @@ def test_every_image_needs_its_line_of_points(text: Path) -> None:
     edit(
         text / "images.txt", lambda content: "\n".join(row for row in content.split("\n") if len(row.split()) == 10 or "#" in row)
     )
-    assert len(pycolmap.Reconstruction(text).images) < len(NAMES)  # the reference shows the fault
+    assert pycolmap.Reconstruction(text).num_images() < len(NAMES)  # the reference shows the fault
     with pytest.raises(UserError, match=r"images\.txt:6: a line of points .* follows each image's, not '2 "):
         colmap_model.read(text)
 

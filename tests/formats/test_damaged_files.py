@@ -130,7 +130,8 @@ def test_accepted_binary_images_equal_those_of_pycolmap(folder: Path) -> None:
         found = read_or_explain(partial(colmap_model.read, path.parent), path)
         if not isinstance(found, dict):
             return
-        reference = {image.name: image for image in pycolmap.Reconstruction(path.parent).images.values()}
+        model = pycolmap.Reconstruction(path.parent)  # its images refer to it
+        reference = {image.name: image for image in model.images.values()}
         assert found.keys() == reference.keys()
         for name, (_, camera, pose) in found.items():
             np.testing.assert_allclose(pose.translation, reference[name].cam_from_world().translation, rtol=0, atol=0)
