@@ -15,9 +15,8 @@ from bench.threat_model import Knowledge
 from bench.types import Features, Floats, Indices, Release, Subspaces
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from bench.codebook.public import Public
+    from bench.images.photographs import Source
     from bench.images.scene import Scene
 
 K = TypeVar("K", bound=Knowledge)
@@ -295,12 +294,14 @@ class Extractor(Plugin, ABC):
     # Public properties of the descriptors, which attacks may use.
     exact_zeros: bool = False  # no component is negative, and many are exactly zero
     eight_bit: bool = False  # each descriptor is an 8-bit integer vector, scaled to unit norm
+    # Whether features are found by the photograph's name, so that its content does not determine them.
+    reads_stored: ClassVar[bool] = False
 
     @abstractmethod
-    def extract(self, image: np.ndarray, source: Path | None = None) -> Features:
+    def extract(self, image: np.ndarray, source: Source | None = None) -> Features:
         """Return the features of an (H, W, 3) uint8 RGB image, in the order of `Features.by_position`.
 
-        `source` is the photograph's file, if it has one.
+        `source` is the photograph's file and its name below the image folder, if it has them.
 
         Raises
         ------

@@ -30,6 +30,7 @@ from bench.formats import tensor_file
 from bench.geometry.nearest_words import unit_rows
 from bench.identification import distractors, thumbnails
 from bench.images import photographs
+from bench.images.photographs import Source
 from bench.images.samples import Sample
 from bench.localization import maps
 from bench.localization.scene_index import SceneIndex
@@ -177,7 +178,7 @@ def check_metric(metric: Metric, seed: int = 0) -> None:
     assert best > value if metric.higher_is_better_for == "attacker" else best < value, "the truth must be the best estimate"
 
 
-def check_extractor(extractor: Extractor, image: np.ndarray, source: Path | None = None) -> None:
+def check_extractor(extractor: Extractor, image: np.ndarray, source: Source | None = None) -> None:
     """Check an extractor: unit descriptors at keypoints within the image, ordered by position, the same at each call."""
     before = image.copy()
     features = extractor.extract(image, source)

@@ -208,7 +208,7 @@ def format_fraction(hits: np.ndarray, subset: np.ndarray) -> str:
 
 def extract_all() -> dict[Source, Features]:
     """Extract the features of the built-in photographs."""
-    return {source: Sift().extract(photographs.read(source.path).pixels, source.path) for source in photographs.list_builtin()}
+    return {source: Sift().extract(photographs.read(source.path).pixels, source) for source in photographs.list_builtin()}
 
 
 # ---- speed

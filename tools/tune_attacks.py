@@ -200,7 +200,7 @@ def measure_photograph(
     tuning: Tuning, source: Source, number: int, defense: Affine, point: int, pool: ReleasePool
 ) -> dict[str, np.ndarray]:
     """Measure all settings on one release. -> `values`, (settings, 3)"""
-    secret = EXTRACTOR.extract(photographs.read(source.path).pixels, source.path)
+    secret = EXTRACTOR.extract(photographs.read(source.path).pixels, source)
     if tuning.keypoints is not None:
         count = min(tuning.keypoints, len(secret))
         secret = secret.take(np.sort(np.random.default_rng(number).choice(len(secret), count, replace=False)))

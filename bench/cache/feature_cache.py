@@ -40,7 +40,7 @@ def extract(extractor: Extractor, pixels: Pixels) -> Features:
     """
 
     def compute() -> store.Content:
-        features = extractor.extract(pixels.read(), getattr(pixels, "path", None))
+        features = extractor.extract(pixels.read(), pixels.file())
         return to_arrays(features), {"size": list(features.size)}
 
     arrays, meta = store.fetch(KIND, _key(extractor, pixels), compute)
@@ -73,8 +73,10 @@ def _extract_to_cache(extractor: Extractor, pixels: Pixels) -> None:
 
 
 def _key(extractor: Extractor, pixels: Pixels) -> dict[str, Any]:
+    file = pixels.file() if extractor.reads_stored else None
     return {
         "image": pixels.content_hash(),
+        **({} if file is None else {"name": file.name}),
         "extractor": spec.to_json(extractor),
         "source": provenance.hash_modules(type(extractor).__module__),
         "libraries": environment.list_library_versions(),

@@ -22,8 +22,8 @@ from typing import TYPE_CHECKING, Literal, get_args
 from bench.api import Dataset
 from bench.core.errors import UserError
 from bench.datasets import colmap
-from bench.datasets.colmap import PosedImage
-from bench.formats import lists, nvm
+from bench.formats import colmap_model, lists, nvm
+from bench.formats.colmap_model import PosedImage
 from bench.images.scene import Condition, Scene
 
 if TYPE_CHECKING:
@@ -121,11 +121,11 @@ def _read_references(root: Path, version: Version | None) -> dict[str, PosedImag
     if len(models) > 1:
         raise UserError(f"{folder}: holds models of both versions; give version=v1 or version=v1.1")
     path = models[0][1]
-    return colmap.read_model(path) if path.is_dir() else _read_nvm(path)
+    return colmap_model.read(path) if path.is_dir() else _read_nvm(path)
 
 
 def _is_model(path: Path) -> bool:
-    return path.is_file() if path.suffix == ".nvm" else colmap.is_model(path)
+    return path.is_file() if path.suffix == ".nvm" else colmap_model.is_model(path)
 
 
 def _read_nvm(path: Path) -> dict[str, PosedImage]:

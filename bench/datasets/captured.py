@@ -18,8 +18,8 @@ from bench.api import Dataset
 from bench.cache import provenance, store
 from bench.core.colmap_log import silence_colmap
 from bench.core.errors import UserError
-from bench.datasets import colmap
-from bench.datasets.colmap import PosedImage
+from bench.formats import colmap_model
+from bench.formats.colmap_model import PosedImage
 from bench.images.photographs import Source, list_photographs
 from bench.images.scene import File, Reference, Scene
 
@@ -55,7 +55,7 @@ class Captured(Dataset):
             raise UserError(
                 f"{self.path}: all {len(sources)} photographs would be queries, and none a reference; lower leading or add some"
             )
-        posed = colmap.read_model(_load_model(self.path, sources))
+        posed = colmap_model.read(_load_model(self.path, sources))
         first, second = self.first or sources[0].name, self.second or sources[len(sources) // 2].name
         scale = self.length / _measure_distance(posed, first, second)
         held_out = {source.name for source in queries}
@@ -115,7 +115,7 @@ def _measure_distance(posed: dict[str, PosedImage], first: str, second: str) -> 
 
 
 def _create_reference(path: Path, camera: pycolmap.Camera, pose: pycolmap.Rigid3d, name: str) -> Reference:
-    pixels = File(path=path, size=(camera.width, camera.height))
+    pixels = File(path=path, size=(camera.width, camera.height), name=name)
     return Reference(name=name, camera=camera, cam_from_world=pose, condition="day", pixels=pixels)
 
 

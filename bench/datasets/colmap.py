@@ -12,22 +12,18 @@ The folder contains
 from __future__ import annotations
 
 from collections.abc import Mapping
-from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, get_args
 
-import numpy as np
-
 from bench.api import Dataset
 from bench.core.errors import UserError
-from bench.formats import lists
+from bench.formats import colmap_model, lists
+from bench.formats.colmap_model import PosedImage
 from bench.images.scene import Condition, File, Reference, Scene, SceneImage
 
 if TYPE_CHECKING:
     import pycolmap
-
-PARTS = ("cameras", "images", "points3D")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +46,7 @@ def load(root: Path) -> Scene:
     """
     if not root.is_dir():
         raise UserError(f"{root}: no such folder")
-    models = [folder for folder in (root / "sparse", root / "sparse" / "0") if is_model(folder)]
+    models = [folder for folder in (root / "sparse", root / "sparse" / "0") if colmap_model.is_model(folder)]
     if not models:
         raise UserError(f"{root / 'sparse'}: no COLMAP model (cameras, images and points3D, .txt or .bin)")
     listed: dict[Condition, Path] = {condition: lists.queries_path(root, condition) for condition in get_args(Condition)}
@@ -59,7 +55,7 @@ def load(root: Path) -> Scene:
         raise UserError(f"{root / 'queries'}: no list of queries; expected {' or '.join(path.name for path in listed.values())}")
     return assemble(
         root.name,
-        references=read_model(models[0]),
+        references=colmap_model.read(models[0]),
         queries=present,
         images=root / "images",
         ground_truth=find_ground_truth(root),
@@ -70,9 +66,6 @@ def load(root: Path) -> Scene:
 def find_ground_truth(root: Path) -> Path | None:
     """Return the file or folder with the poses of the queries; None if there is none."""
     return next((path for path in (root / "ground_truth.txt", root / "ground_truth") if path.exists()), None)
-
-
-PosedImage = tuple[str, "pycolmap.Camera", "pycolmap.Rigid3d"]  # file and line, for messages; intrinsics; camera from world
 
 
 def assemble(
@@ -113,69 +106,10 @@ def assemble(
     return Scene(name=name, references=tuple(reference_images), queries=tuple(query_images.values()))
 
 
-def read_model(folder: Path) -> dict[str, PosedImage]:
-    """Return the images of a COLMAP model that have a pose, by name.
-
-    Raises
-    ------
-    UserError
-        if the model is damaged or contains no pose; the message names the file and, for text, the line.
-    """
-    import pycolmap
-
-    wheres = _check_text(folder) if (folder / "images.txt").is_file() else {}
-    try:
-        model = pycolmap.Reconstruction(folder)
-    except (ValueError, RuntimeError) as error:
-        raise UserError(f"{folder}: not a whole COLMAP model: {error}") from None
-    posed: dict[str, PosedImage] = {}
-    for number, image in sorted(model.images.items()):
-        where = wheres.get(image.name, f"{folder}, image {number}")
-        if not image.has_pose:
-            continue
-        if image.name in posed:
-            raise UserError(f"{where}: {image.name} is in this model twice")
-        # Copies: pycolmap returns references into the model, which is freed on return.
-        camera, pose = deepcopy(image.camera), image.cam_from_world()
-        if not (np.isfinite(pose.matrix()).all() and np.isfinite(camera.params).all()):
-            raise UserError(f"{where}: the pose or the intrinsics of {image.name} are not finite")
-        posed[image.name] = where, camera, pose
-    if not posed:
-        raise UserError(f"{folder}: no image of this model has a pose")
-    return posed
-
-
-def is_model(folder: Path) -> bool:
-    return any(all((folder / f"{part}.{suffix}").is_file() for part in PARTS) for suffix in ("txt", "bin"))
-
-
-def _check_text(folder: Path) -> dict[str, str]:
-    """Check faults that pycolmap accepts, or reports without file and line. -> name of an image: its file and line"""
-    cameras = set()
-    for number, fields in lists.read_fields(folder / "cameras.txt"):
-        lists.parse_camera(fields[1:], f"{folder / 'cameras.txt'}:{number}")
-        cameras.add(fields[0])
-    path, wheres, points = folder / "images.txt", {}, False
-    for number, line in lists.read_lines(path):
-        where = f"{path}:{number}"
-        if points or line.startswith("#") or not line.strip():
-            points = False  # the line after an image's holds its points, if any
-            continue
-        fields = line.split()
-        if len(fields) != 10:
-            raise UserError(f"{where}: an image has 10 fields (id qw qx qy qz tx ty tz camera name), but there are {len(fields)}")
-        lists.parse_pose(fields[1:8], where)
-        if fields[8] not in cameras:
-            raise UserError(f"{where}: there is no camera {fields[8]} in {folder / 'cameras.txt'}")
-        wheres[fields[9]] = where
-        points = True
-    return wheres
-
-
 def _read_poses(path: Path) -> dict[str, tuple[str, pycolmap.Rigid3d]]:
     """Read a list of poses or a model. -> by name: file and line, and camera from world"""
     if path.is_dir():
-        return {name: (where, pose) for name, (where, _, pose) in read_model(path).items()}
+        return {name: (where, pose) for name, (where, _, pose) in colmap_model.read(path).items()}
     return {name: (f"{path}:{line}", pose) for name, (line, pose) in lists.read_poses(path).items()}
 
 
@@ -184,7 +118,8 @@ def _find_image(name: str, where: str, camera: pycolmap.Camera, images: Path, ma
     if not path.is_file():
         raise UserError(f"{where}: there is no image {path}")
     mask = None if masks is None else (masks / name).with_suffix(".png")
-    return File(path=path, size=(camera.width, camera.height), mask=mask if mask is not None and mask.is_file() else None)
+    mask = mask if mask is not None and mask.is_file() else None
+    return File(path=path, size=(camera.width, camera.height), mask=mask, name=name)
 
 
 PLUGIN = Colmap

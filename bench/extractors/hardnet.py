@@ -18,6 +18,7 @@ from bench.api import Extractor
 from bench.core.errors import UserError
 from bench.extractors.sift import Sift
 from bench.geometry.nearest_words import unit_rows
+from bench.images.photographs import Source
 from bench.types import Features, Floats
 
 HUB = Path("hub")
@@ -41,7 +42,7 @@ class HardNet(Extractor):
         if self.max_keypoints < 1:
             raise UserError(f"hardnet: max_keypoints must be at least 1, got {self.max_keypoints}")
 
-    def extract(self, image: np.ndarray, source: Path | None = None) -> Features:
+    def extract(self, image: np.ndarray, source: Source | None = None) -> Features:
         sift_features = Sift(max_keypoints=self.max_keypoints).extract(image, source)
         assert sift_features.frames is not None
         rows = _describe(image, sift_features.keypoints, sift_features.frames[:, 0], self.weights)

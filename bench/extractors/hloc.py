@@ -1,27 +1,36 @@
 """Features that hloc extracted (Sarlin et al., CVPR 2019), read from an HDF5 file with a group for each image.
 
-The name of a group is the image's path below hloc's image folder. A group holds `keypoints` (N, 2), `descriptors` (D, N) and
-`image_size` (width, height). hloc puts the centre of the first pixel at (0, 0), so half a pixel is added. hloc ignores EXIF
-rotation, so a photograph with an EXIF rotation is refused.
+The name of a group is the image's path below hloc's image folder, and must be the path below ours. A group holds `keypoints`
+(N, 2), `descriptors` (D, N) and `image_size` (width, height). hloc puts the centre of the first pixel at (0, 0), so half a pixel
+is added. hloc ignores EXIF rotation, so a photograph with an EXIF rotation is refused.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from bench.api import Extractor
 from bench.core.errors import SampleError, UserError
-from bench.formats.stored_features import map_into_square, match_name, read_upright_size
+from bench.formats.stored_features import NAMES_HINT, check_name, map_into_square, read_upright_size
 from bench.geometry.nearest_words import unit_rows
-from bench.types import Features, Floats
+from bench.images.photographs import Source
+from bench.types import Features
+
+if TYPE_CHECKING:
+    import h5py
+
+MAX_BYTES = 2**30  # of one array; a greater one is taken for damage
 
 
 @dataclass(frozen=True, kw_only=True)
 class Hloc(Extractor):
     """Reads features from an HDF5 file in hloc's layout, and moves the keypoints into the benchmark's square."""
+
+    reads_stored: ClassVar[bool] = True
 
     path: Path
     dimension: int = 128  # of a descriptor
@@ -36,54 +45,79 @@ class Hloc(Extractor):
         if not h5py.is_hdf5(self.path):
             raise UserError(f"hloc: {self.path}: not an HDF5 file")
 
-    def extract(self, image: np.ndarray, source: Path | None = None) -> Features:
+    def extract(self, image: np.ndarray, source: Source | None = None) -> Features:
         if source is None:
             raise UserError(
-                "hloc: features are found by the photograph's file, but this image has none. Training and dictionaries use "
+                "hloc: features are found by the photograph's name, but this image has none. Training and dictionaries use "
                 "mirrored views: choose an extractor that computes features"
             )
-        keypoints, stored, size = self._read(source)
-        _check(source, stored, len(keypoints), self.dimension, size)
-        descriptors = stored.T  # (N, D)
+        keypoints, descriptors, size = self._read(source)
+        read_upright_size(source, size)
         side = image.shape[0]
         xy = map_into_square(keypoints + 0.5, size, side)  # (N, 2)
         keep = ((xy >= 0) & (xy < side)).all(axis=1)
         if not keep.any():
             raise SampleError(f"{source.name}: no keypoint of {self.path} lies in the photograph's central square")
         codes = np.ascontiguousarray(descriptors[keep]) if descriptors.dtype == np.uint8 else None
-        rows = unit_rows(descriptors[keep].astype(np.float32))
+        rows = unit_rows(descriptors[keep])
         features = Features(keypoints=xy[keep].astype(np.float32), descriptors=rows, codes=codes, size=(side, side))
         return features.by_position()
 
-    def _read(self, source: Path) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
-        """Read the group. -> keypoints (N, 2), descriptors (D, N), and the (width, height) of the image"""
+    def _read(self, source: Source) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
+        """Read and check the group. -> keypoints (N, 2) float64, descriptors (N, D), and the (width, height) of the image"""
         import h5py
 
-        with h5py.File(self.path) as opened:
-            name = match_name(source, opened)
-            group = None if name is None else opened[name]
-            if group is None:
-                raise SampleError(f"{source.name}: {self.path} has no features of it")
-            missing = [name for name in ("keypoints", "descriptors", "image_size") if name not in group]
-            if missing:
-                raise SampleError(f"{source.name}: {self.path}, group {group.name}: no dataset {missing[0]!r}")
-            keypoints, descriptors = group["keypoints"][()], group["descriptors"][()]
-            width, height = (int(side) for side in group["image_size"][()])
-        if keypoints.ndim != 2 or keypoints.shape[1] != 2:
-            raise SampleError(f"{source.name}: keypoints have shape {keypoints.shape}, expected (N, 2)")
-        return keypoints.astype(np.float64), descriptors, (width, height)
+        check_name(source.name)
+        where = f"{source.name}: {self.path}"
+        try:
+            with h5py.File(self.path) as opened:
+                group = opened.get(source.name)
+                if not isinstance(group, h5py.Group):
+                    raise SampleError(f"{where} has no features of that name; {NAMES_HINT}")
+                keypoints = _read_array(group, "keypoints", 2, where)
+                descriptors = _read_array(group, "descriptors", 2, where)
+                size = _read_array(group, "image_size", 1, where)
+        except (SampleError, MemoryError):
+            raise
+        except Exception as error:  # h5py raises errors of any class for damaged files: OSError, KeyError, TypeError, ...
+            raise SampleError(f"{where} is damaged, or not in hloc's layout: {error}") from error
+        if descriptors.dtype != np.uint8:
+            with np.errstate(over="ignore"):
+                descriptors = descriptors.astype(np.float32)
+        _check(keypoints, descriptors, self.dimension, where)
+        if len(size) != 2 or not ((size >= 1) & (size < 2**31)).all() or not (size == np.floor(size)).all():
+            raise SampleError(f"{where}: image_size is {size.tolist()}, expected a width and a height")
+        return keypoints.astype(np.float64), descriptors.T, (int(size[0]), int(size[1]))
 
 
-def _check(source: Path, descriptors: Floats, count: int, dimension: int, size: tuple[int, int]) -> None:
+def _read_array(group: h5py.Group, name: str, dimensions: int, where: str) -> np.ndarray:
+    """Return a dataset of numbers. Its shape is checked before it is read, since a small file can state a vast one."""
+    import h5py
+
+    dataset = group.get(name)
+    if not isinstance(dataset, h5py.Dataset):
+        raise SampleError(f"{where}: no dataset {name!r}")
+    if dataset.dtype.kind not in "fiu" or dataset.shape is None:
+        raise SampleError(f"{where}: {name} is of type {dataset.dtype}, expected numbers")
+    if len(dataset.shape) != dimensions or dataset.size * dataset.dtype.itemsize > MAX_BYTES:
+        raise SampleError(f"{where}: {name} has shape {dataset.shape}")
+    return np.asarray(dataset[()])
+
+
+def _check(keypoints: np.ndarray, descriptors: np.ndarray, dimension: int, where: str) -> None:
+    count = len(keypoints)
+    if keypoints.shape[1] != 2:
+        raise SampleError(f"{where}: keypoints have shape {keypoints.shape}, expected (N, 2)")
     if count == 0:
-        raise SampleError(f"{source.name}: no keypoint")
+        raise SampleError(f"{where}: no keypoint")
     if descriptors.shape != (dimension, count):
-        raise SampleError(f"{source.name}: descriptors have shape {descriptors.shape}, expected ({dimension}, {count})")
+        raise SampleError(f"{where}: descriptors have shape {descriptors.shape}, expected ({dimension}, {count})")
+    if not np.isfinite(keypoints).all():
+        raise SampleError(f"{where}: keypoints hold values that are not finite")
     if not np.isfinite(descriptors).all():
-        raise SampleError(f"{source.name}: descriptors hold values that are not finite")
+        raise SampleError(f"{where}: descriptors hold values that are not finite")
     if not descriptors.any(axis=0).all():
-        raise SampleError(f"{source.name}: a descriptor is zero")
-    read_upright_size(source, size)
+        raise SampleError(f"{where}: a descriptor is zero")
 
 
 PLUGIN = Hloc

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 import sys
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
 from bench.api import Extractor
 from bench.core.errors import SampleError, UserError
 from bench.geometry.nearest_words import unit_rows
+from bench.images.photographs import Source
 from bench.types import Features, Indices
 
 
@@ -35,7 +35,7 @@ class Sift(Extractor):
         if self.contrast_threshold < 0 or self.edge_threshold <= 0 or self.max_keypoints < 1:
             raise UserError("sift: thresholds must be positive and max_keypoints at least 1")
 
-    def extract(self, image: np.ndarray, source: Path | None = None) -> Features:
+    def extract(self, image: np.ndarray, source: Source | None = None) -> Features:
         import cv2
 
         sift = cv2.SIFT_create(  # type: ignore[attr-defined]

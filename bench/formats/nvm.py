@@ -17,6 +17,8 @@ from bench.formats import lists
 if TYPE_CHECKING:
     import pycolmap
 
+FIELDS = 10  # of a camera, after its name
+
 
 def read(path: Path) -> dict[str, tuple[int, pycolmap.Rigid3d]]:
     """Return name -> (line number, camera from world).
@@ -28,32 +30,38 @@ def read(path: Path) -> dict[str, tuple[int, pycolmap.Rigid3d]]:
     """
     import pycolmap
 
-    rows = lists.read_fields(path)
-    number, header = next(rows, (1, []))
-    if not header or header[0] != "NVM_V3":
+    rows = lists.read_rows(path)
+    number, header = next(rows, (1, ""))
+    if header.split()[:1] != ["NVM_V3"]:
         raise UserError(f"{path}:{number}: an NVM model begins with NVM_V3")
-    number, count = next(rows, (number, []))
-    if len(count) != 1 or not count[0].isdecimal():
-        raise UserError(f"{path}:{number}: expected the number of cameras, not {' '.join(count)!r}")
+    number, text = next(rows, (number, ""))
+    if (count := lists.parse_whole(text)) is None:
+        raise UserError(f"{path}:{number}: expected the number of cameras, not {lists.shorten(text)!r}")
     poses: dict[str, tuple[int, pycolmap.Rigid3d]] = {}
-    for _ in range(int(count[0])):
-        number, fields = next(rows, (number, []))
+    while len(poses) < count:
+        number, text = next(rows, (number, ""))
         where = f"{path}:{number}"
-        if len(fields) != 11:
+        name, fields = lists.split_name(text, FIELDS) if text else ("", [])
+        if len(fields) != FIELDS:
             raise UserError(
-                f"{where}: a camera has 11 fields, but there are {len(fields)}; the header announces {count[0]} cameras"
+                f"{where}: a camera has 11 fields, but there are {len(text.split())}; the header announces {count} cameras"
             )
-        name = fields[0]
         if name in poses:
             raise UserError(f"{where}: {name} occurs a second time; the first is line {poses[name][0]}")
-        values = lists.parse_numbers(fields[1:], where)
+        values = lists.parse_numbers(fields, where)
         rotation = lists.parse_rotation(values[1:5], where)
         poses[name] = number, pycolmap.Rigid3d(rotation, -(rotation.matrix() @ values[5:8]))
+    number, text = next(rows, (number, "0"))
+    if lists.parse_whole(text) is None:
+        raise UserError(
+            f"{path}:{number}: expected the number of points after the {count} cameras of the header, not {lists.shorten(text)!r}"
+        )
     return poses
 
 
 def write(path: Path, images: Mapping[str, tuple[pycolmap.Camera, pycolmap.Rigid3d]]) -> None:
-    """Write cameras and poses, without points."""
+    """Write cameras and poses, without points. Raises UserError for a name that the file cannot hold."""
+    lists.check_names(images)
     rows = ["NVM_V3", "", str(len(images))]
     for name, (camera, pose) in images.items():
         values = [camera.mean_focal_length(), *lists.to_wxyz(pose), *pose.inverse().translation]

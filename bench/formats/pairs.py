@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from bench.core.errors import UserError
@@ -20,7 +20,10 @@ def read(path: Path) -> dict[str, list[str]]:
     pairs: dict[str, list[str]] = {}
     for number, fields in lists.read_fields(path):
         if len(fields) != 2:
-            raise UserError(f"{path}:{number}: a pair is two names, 'query reference', but there are {len(fields)} fields")
+            raise UserError(
+                f"{path}:{number}: a pair is two names, 'query reference', but there are {len(fields)} fields; names with spaces "
+                "cannot be in such a list"
+            )
         query, reference = fields
         references = pairs.setdefault(query, [])
         if reference in references:
@@ -37,15 +40,22 @@ def write(path: Path, pairs: Mapping[str, Sequence[str]]) -> int:
     Raises
     ------
     UserError
-        if a name contains a space, since the file could not be read.
+        as `check_names`.
     """
     rows = [(query, reference) for query, references in pairs.items() for reference in references]
-    for name in {*pairs, *(reference for _, reference in rows)}:
-        if len(name.split()) != 1:
-            raise UserError(f"{name!r}: a list of pairs cannot hold a name with a space in it")
+    check_names({*pairs, *(reference for _, reference in rows)})
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text("".join(f"{query} {reference}\n" for query, reference in rows), encoding="utf-8")
     return len(rows)
+
+
+def check_names(names: Iterable[str]) -> None:
+    """Raise UserError for a name that the file cannot hold: with a space, of a comment, or not in UTF-8."""
+    for name in sorted(names):
+        if len(name.split()) != 1:
+            raise UserError(f"{name!r}: a list of pairs cannot hold a name with a space in it")
+        if name.startswith("#") or not lists.is_utf8(name):
+            raise UserError(f"{name!r}: a list of pairs cannot hold a name that begins with #, or is not UTF-8")
 
 
 def pair_all(names: Sequence[str]) -> dict[str, Sequence[str]]:

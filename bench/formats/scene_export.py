@@ -33,6 +33,7 @@ def write(scene: Scene, layout: str, out: Path) -> None:
         raise UserError(f"--layout {layout}: unknown layout; available: {', '.join(LAYOUTS)}")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise UserError(f"--out {out}: exists already; give a new folder")
+    lists.check_names(image.name for image in scene.references + scene.queries)
     images = LAYOUTS[layout](scene, out)
     poses = {query.name: query.cam_from_world for query in scene.queries if query.cam_from_world is not None}
     if poses:

@@ -1,24 +1,25 @@
 """Coordinates of features from other programs: conversion between the stored photograph and the benchmark's square.
 
-The name of a photograph in a file of features is its path below the other program's image folder.
+The name of a photograph in a file of features is its path below the other program's image folder. It is compared with the path
+below ours as given: no link is resolved, and no part of the path is left out.
 """
 
 from __future__ import annotations
-
-from collections.abc import Container
-from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
 from bench.core.errors import SampleError
+from bench.formats import lists
+from bench.images.photographs import Source, read_orientation
 
-ORIENTATION = 0x0112  # the EXIF tag; 1 is upright
+NAMES_HINT = "names are paths below the image folder: give the folder that the features were extracted from"
 
 
 def map_into_square(xy: np.ndarray, size: tuple[int, int], side: int) -> np.ndarray:
     """Map points of an image of `size` (width, height) to its largest centred square, resized to `side`. (N, 2) -> (N, 2)"""
-    return (xy - _find_corner(size)) * (side / min(size))
+    with np.errstate(over="ignore"):  # damaged files hold points at infinity, which are outside
+        return (xy - _find_corner(size)) * (side / min(size))
 
 
 def map_out_of_square(xy: np.ndarray, size: tuple[int, int], side: int) -> np.ndarray:
@@ -26,14 +27,13 @@ def map_out_of_square(xy: np.ndarray, size: tuple[int, int], side: int) -> np.nd
     return xy * (min(size) / side) + _find_corner(size)
 
 
-def match_name(source: Path, names: Container[str]) -> str | None:
-    """Return the longest suffix of a photograph's path that is in `names`; None if there is none."""
-    parts = source.resolve().parts[1:]
-    ends = ("/".join(parts[start:]) for start in range(len(parts)))
-    return next((end for end in ends if end in names), None)
+def check_name(name: str) -> None:
+    """Raise SampleError if a photograph's name is not UTF-8, in which other programs store names."""
+    if not lists.is_utf8(name):
+        raise SampleError(f"{name!a}: this name is not UTF-8; rename the file")
 
 
-def read_upright_size(source: Path, size: tuple[int, int] | None = None) -> tuple[int, int]:
+def read_upright_size(source: Source, size: tuple[int, int] | None = None) -> tuple[int, int]:
     """Return the width and height of the stored photograph, and check that they equal `size`, if given.
 
     Raises
@@ -42,15 +42,18 @@ def read_upright_size(source: Path, size: tuple[int, int] | None = None) -> tupl
         if the photograph has another size, or an EXIF rotation, which features of other programs ignore.
     """
     try:
-        with Image.open(source) as opened:
-            if size is not None and opened.size != size:
-                sizes = f"the features are of an image of {size} pixels, the photograph has {opened.size}"
-                raise SampleError(f"{source.name}: {sizes}")
-            if opened.getexif().get(ORIENTATION, 1) != 1:
-                raise SampleError(f"{source.name}: it has an EXIF rotation, which features of other programs ignore")
-            return opened.size
-    except OSError as error:
+        with Image.open(source.path) as opened:
+            found = opened.size
+            orientation = read_orientation(opened)
+    except MemoryError:
+        raise
+    except Exception as error:  # Pillow raises errors of any class for damaged files
         raise SampleError(f"{source.name}: cannot be read as an image: {error}") from error
+    if orientation != 1:
+        raise SampleError(f"{source.name}: it has an EXIF rotation, which features of other programs ignore")
+    if size is not None and found != size:
+        raise SampleError(f"{source.name}: the features are of an image of {size} pixels, the photograph has {found}")
+    return found
 
 
 def _find_corner(size: tuple[int, int]) -> np.ndarray:

@@ -1,19 +1,24 @@
 """Photographs as 256 x 256 RGB images, all converted by one rule.
 
 The rule: EXIF rotation is applied. Transparency is composited over white. A single channel is repeated three times. 16 bits are
-scaled to 8. The largest centred square is cropped and resized with Pillow's bicubic filter, which averages if it shrinks.
+scaled to 8. The first page of a TIFF file is read. The largest centred square is cropped and resized with Pillow's bicubic
+filter, which averages if it shrinks.
 """
 
 from __future__ import annotations
 
 import hashlib
 import importlib.util
+import logging
 import re
+import warnings
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, ImageOps
+from PIL import ExifTags, Image
 
 from bench.core.errors import SampleError, UserError
 from bench.types import Bytes
@@ -21,7 +26,26 @@ from bench.types import Bytes
 SIDE = 256  # pixels
 MIN_SIDE = 32  # pixels
 MEGADEPTH = re.compile(r"dense\d+")  # the folder of a reconstruction; its subfolder `imgs` holds the photographs
-SUFFIXES = {".jpg", ".jpeg", ".png", ".ppm", ".webp"}
+DEEPEST = 65535  # the greatest value of 16 bits
+SUFFIXES = {".avif", ".bmp", ".jfif", ".jpeg", ".jpg", ".png", ".ppm", ".tif", ".tiff", ".webp"}
+# Formats of photographs that are not read: HEIF, raw files of cameras, JPEG 2000, JPEG XL, and others.
+UNREAD = {
+    *(".heic", ".heif", ".hif", ".jp2", ".j2k", ".jxl", ".jpe", ".gif", ".pgm", ".pnm", ".tga", ".psd", ".exr", ".hdr"),
+    *(".arw", ".cr2", ".cr3", ".dng", ".nef", ".orf", ".raf", ".raw", ".rw2"),
+}
+RESOURCE_FORK = "._"  # begins the names of files that macOS writes beside others on foreign disks
+NAMED = 3  # files of each kind that a message names
+# EXIF orientation -> the transposition that makes the picture upright (Exif 2.32, table 6).
+UPRIGHT: Mapping[int, Image.Transpose] = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_270,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}
+INVERSE = {6: 8, 8: 6}  # all other transpositions are their own inverses
 
 
 @dataclass(frozen=True)
@@ -44,7 +68,10 @@ class Photograph:
 
 
 def list_photographs(directory: Path) -> list[Source]:
-    """Return the JPEG, PNG, PPM and WebP files of a folder and its subfolders, sorted by path.
+    """Return the JPEG, PNG, TIFF, BMP, PPM, WebP and AVIF files of a folder and its subfolders, sorted by path.
+
+    A linked file or folder counts as part of the folder that holds the link. One logged line names the photographs that are left
+    out: files of other formats, resource forks of macOS, broken links, and folders that cannot be read.
 
     In MegaDepth (Li and Snavely, CVPR 2018), only files in `dense*/imgs` are photographs. In HPatches (Balntas et al., CVPR
     2017), all six files of each sequence are.
@@ -56,11 +83,70 @@ def list_photographs(directory: Path) -> list[Source]:
     """
     if not directory.is_dir():
         raise UserError(f"--images {directory}: no such folder")
-    files = sorted(path for path in directory.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file())
+    files, left_out = _find_files(directory)
+    if left_out:
+        _log_once(f"--images {directory}: left out: {_describe(left_out, directory)}")
     files = [path for path in files if path.parent.name == "imgs" and MEGADEPTH.fullmatch(path.parents[1].name)] or files
     if not files:
         raise UserError(f"--images {directory}: no photograph in it (looked for {', '.join(sorted(SUFFIXES))})")
     return [Source(path.relative_to(directory).as_posix(), path) for path in files]
+
+
+@cache
+def _log_once(line: str) -> None:
+    """Log a line unless this process has: a run lists its folder several times."""
+    logging.getLogger(__name__).warning(line)
+
+
+def _find_files(directory: Path) -> tuple[list[Path], dict[str, list[Path]]]:
+    """Find photographs. -> their paths, sorted, and by reason, those that are left out"""
+    files: list[Path] = []
+    left_out: dict[str, list[Path]] = {}
+    pending = [(directory, frozenset[Path]())]
+    while pending:
+        folder, above = pending.pop()
+        inside = above | {folder.resolve()}
+        try:
+            entries = sorted(folder.iterdir())
+        except OSError as error:
+            left_out.setdefault(f"cannot be read: {error.strerror}", []).append(folder)
+            continue
+        for entry in entries:
+            if entry.is_dir():
+                if entry.is_symlink() and entry.resolve() in inside:
+                    left_out.setdefault("a link to a folder that contains it", []).append(entry)
+                else:
+                    pending.append((entry, inside))
+            elif (reason := _explain_left_out(entry)) is not None:
+                left_out.setdefault(reason, []).append(entry)
+            elif entry.suffix.lower() in SUFFIXES:
+                files.append(entry)
+    return sorted(files), left_out
+
+
+def _explain_left_out(path: Path) -> str | None:
+    """Return why a photograph is not read; None if it is read, or is no photograph."""
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES | UNREAD:
+        return None
+    if path.name.startswith(RESOURCE_FORK):
+        return "a resource fork of macOS"
+    if suffix in UNREAD:
+        return f"{suffix[1:].upper()} is not read; convert it to PNG or JPEG"
+    return None if path.is_file() else "no file, or a broken link"
+
+
+def _describe(left_out: Mapping[str, list[Path]], directory: Path) -> str:
+    """Describe files that are left out in one line."""
+
+    def list_names() -> Iterator[str]:
+        for reason, paths in sorted(left_out.items()):
+            names = [path.relative_to(directory).as_posix() for path in sorted(paths)[:NAMED]]
+            printable = [name if name.isprintable() else ascii(name) for name in names]
+            more = [f"{len(paths) - NAMED} more"] if len(paths) > NAMED else []
+            yield f"{', '.join(printable + more)} ({reason})"
+
+    return "; ".join(list_names())
 
 
 def split_validation(sources: list[Source], selection: Path | None) -> tuple[list[Source], list[Source]]:
@@ -79,7 +165,10 @@ def split_validation(sources: list[Source], selection: Path | None) -> tuple[lis
     if selection is None:
         names = {source.name for source in sources[::20]}
     elif selection.is_file():
-        names = set(selection.read_text(encoding="utf-8").split("\n"))
+        try:
+            names = set(selection.read_text(encoding="utf-8-sig").split("\n"))
+        except UnicodeDecodeError as error:
+            raise UserError(f"{selection}: not a text file: {error}") from None
     else:
         raise UserError(f"{selection}: no such folder or file")
     validation = [source for source in sources if source.name in names]
@@ -141,30 +230,76 @@ def read(path: Path) -> Photograph:
 
 
 def decode(path: Path, upright: bool = True) -> tuple[Image.Image, tuple[str, ...]]:
-    """Return an 8-bit RGB image in the size of the file, and notes on its conversion. `upright` applies EXIF rotation."""
+    """Return an 8-bit RGB image in the size of the file, and notes on its conversion. `upright` applies EXIF rotation.
+
+    Raises
+    ------
+    SampleError
+        if the file cannot be decoded, is smaller than 32 pixels on a side, or its values have no defined range.
+    """
     try:
         with Image.open(path) as opened:
+            notes = _list_remarks(opened)
+            orientation = read_orientation(opened)
             opened.load()
-            image = ImageOps.exif_transpose(opened) if upright else opened
+            image = _rotate(opened, orientation, upright)
+        image, more = _convert(image, path.name)
     except Image.DecompressionBombError as error:
         raise SampleError(f"{path.name}: too many pixels to read safely ({error})") from error
-    except (OSError, SyntaxError, ValueError) as error:
-        # Messages of Pillow: "image file is truncated", "cannot identify image file", ...
+    except (SampleError, MemoryError):
+        raise
+    except Exception as error:
+        # Pillow's readers raise errors of any class for damaged files: OSError, SyntaxError, KeyError, struct.error, ...
         raise SampleError(f"{path.name}: cannot be read as an image: {error}") from error
+    return image, tuple(f"{path.name}: {note}" for note in (*notes, *more))
+
+
+def read_orientation(image: Image.Image) -> int:
+    """Return the EXIF orientation of an opened image, from 1 (upright) to 8. It is 1 if the file states no valid one.
+
+    Only this tag is read, since the others may be damaged without harm to the picture.
+    """
+    try:
+        with warnings.catch_warnings(action="ignore"):  # of corrupt EXIF data
+            orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
+        return int(orientation) if orientation in UPRIGHT else 1
+    except Exception:  # as in `decode`: damaged EXIF data raise errors of any class
+        return 1
+
+
+def _list_remarks(image: Image.Image) -> list[str]:
+    pages = getattr(image, "n_frames", 1) if image.format == "TIFF" else 1
+    return [f"{pages} pages, of which the first is read"] if pages > 1 else []
+
+
+def _rotate(image: Image.Image, orientation: int, upright: bool) -> Image.Image:
+    """Return the image upright or as stored. Pillow loads TIFF files upright, and all others as stored."""
+    loaded_upright = image.format == "TIFF"
+    if loaded_upright == upright or orientation == 1:
+        return image
+    return image.transpose(UPRIGHT[orientation if upright else INVERSE.get(orientation, orientation)])
+
+
+def _convert(image: Image.Image, name: str) -> tuple[Image.Image, list[str]]:
+    """Convert to 8-bit RGB. -> image, and notes"""
     if min(image.size) < MIN_SIDE:
-        raise SampleError(f"{path.name}: {image.width} x {image.height} pixels; at least {MIN_SIDE} x {MIN_SIDE} are needed")
+        raise SampleError(f"{name}: {image.width} x {image.height} pixels; at least {MIN_SIDE} x {MIN_SIDE} are needed")
     notes = []
-    if image.mode.startswith("I") or image.mode == "F":
-        notes.append(f"{path.name}: 16 bits a channel, scaled to 8")
+    if image.mode == "F":
+        raise SampleError(f"{name}: its pixels are floating-point numbers of no defined range; convert it to 8 or 16 bits")
+    if image.mode.startswith("I"):
         deep = np.asarray(image, dtype=np.float64)
-        image = Image.fromarray(np.clip(np.rint(deep / 257.0), 0, 255).astype(np.uint8))
+        if deep.min() < 0 or deep.max() > DEEPEST:
+            raise SampleError(f"{name}: its pixels are not between 0 and {DEEPEST}; convert it to 8 or 16 bits")
+        notes.append("16 bits a channel, scaled to 8")
+        image = Image.fromarray(np.rint(deep / 257.0).astype(np.uint8))
     if "A" in image.getbands() or "transparency" in image.info:
-        notes.append(f"{path.name}: transparency, composited over white")
+        notes.append("transparency, composited over white")
         rgba = image.convert("RGBA")
         image = Image.alpha_composite(Image.new("RGBA", rgba.size, "white"), rgba)
     if image.mode in ("L", "LA", "1"):
-        notes.append(f"{path.name}: grey, its channel is used as red, green and blue")
-    return image.convert("RGB"), tuple(notes)
+        notes.append("grey, its channel is used as red, green and blue")
+    return image.convert("RGB"), notes
 
 
 def crop_square(image: Image.Image, side: int) -> Bytes:

@@ -123,11 +123,6 @@ def read_foreground(image: ImageSource) -> Mask | None:
     return None if isinstance(image, Source) else image.foreground()
 
 
-def image_path(image: ImageSource) -> Path | None:
-    """Return the file of an image, None if it has none."""
-    return getattr(image, "path", None)
-
-
 def _content_hash(image: ImageSource) -> str:
     try:
         return image.content_hash()

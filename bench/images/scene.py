@@ -38,6 +38,10 @@ class Pixels(ABC):
     def read(self) -> Bytes:
         """Return (H, W, 3) uint8 RGB, in the size of the image's camera."""
 
+    def file(self) -> Source | None:
+        """Return the photograph's file and its name below the image folder; None if it has none."""
+        return None
+
     def foreground(self) -> Mask | None:
         """Return the mask of moving objects in front of the scene, (H, W); None if it is not known."""
         return None
@@ -50,6 +54,7 @@ class File(Pixels):
     path: Path
     size: tuple[int, int]  # width, height of the camera
     mask: Path | None = None  # an image that is white on the foreground
+    name: str | None = None  # below the image folder; None if there is no such folder
 
     def content_hash(self) -> str:
         return Source(self.path.name, self.path).content_hash()
@@ -57,6 +62,9 @@ class File(Pixels):
     def read(self) -> Bytes:
         """Return the pixels; raise SampleError if the file cannot be decoded or has another size."""
         return np.array(self._decode(self.path))
+
+    def file(self) -> Source | None:
+        return None if self.name is None else Source(self.name, self.path)
 
     def foreground(self) -> Mask | None:
         return None if self.mask is None else np.asarray(self._decode(self.mask).convert("L")) > 127

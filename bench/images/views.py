@@ -49,7 +49,7 @@ def _extract_view(pixels: Bytes, mirrored: bool, photograph: str, source: Source
     if mirrored:  # features that are stored with the file are those of the unmirrored photograph
         mirror = np.ascontiguousarray(pixels[:, ::-1])
         return PhotographView(photograph, mirror, extractor.extract(mirror, None))
-    return PhotographView(photograph, pixels, extractor.extract(pixels, source.path))
+    return PhotographView(photograph, pixels, extractor.extract(pixels, source))
 
 
 class LazyViews(Sequence[PhotographView]):

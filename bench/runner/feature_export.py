@@ -16,7 +16,8 @@ import numpy as np
 from bench.api import Attack, ImageAttack
 from bench.cache.attack_cache import recover_cached
 from bench.core.errors import SampleError, UserError
-from bench.formats.stored_features import map_out_of_square, read_upright_size
+from bench.formats.stored_features import check_name, map_out_of_square, read_upright_size
+from bench.images.photographs import Source
 from bench.task_api import Trial
 from bench.tasks.reconstruction import build_view
 from bench.types import Bytes, Descriptors, Floats, WordSets
@@ -43,8 +44,9 @@ def collect_features(trial: Trial, path: Path, attack: Attack | None) -> ImageFe
     Raises
     ------
     SampleError
-        if there are no descriptors, or the photograph has an EXIF rotation.
+        if there are no descriptors, the photograph has an EXIF rotation, or its name is not UTF-8, as other programs need it.
     """
+    check_name(trial.sample.name)
     release = trial.release
     if isinstance(attack, ImageAttack):
         raise SampleError(f"{attack.name()} does not recover descriptors")
@@ -58,7 +60,7 @@ def collect_features(trial: Trial, path: Path, attack: Attack | None) -> ImageFe
         rows = release.candidates.reshape(len(keypoints), -1)  # (N m, D)
     else:
         raise SampleError(f"a release of {type(release).__name__} has no descriptors; give --attack to export recovered ones")
-    size = read_upright_size(path)
+    size = read_upright_size(Source(trial.sample.name, path))
     moved = map_out_of_square(keypoints.astype(np.float64), size, release.size[0]).astype(np.float32)
     return ImageFeatures(name=trial.sample.name, path=path, size=size, keypoints=moved, descriptors=rows)
 
@@ -75,7 +77,13 @@ def write_hloc(images: Sequence[ImageFeatures], out: Path) -> None:
 
 
 def write_colmap(images: Sequence[ImageFeatures], out: Path) -> None:
-    """Write a database in the format of COLMAP's feature extractor, with cameras that COLMAP reads from the images."""
+    """Write a database in the format of COLMAP's feature extractor, with cameras that COLMAP reads from the images.
+
+    Raises
+    ------
+    UserError
+        if COLMAP cannot read one of the images; no file is left.
+    """
     import pycolmap
 
     root = _find_root(images)
@@ -84,14 +92,16 @@ def write_colmap(images: Sequence[ImageFeatures], out: Path) -> None:
     names = [image.name for image in images]
     pycolmap.import_images(out, root, camera_mode=pycolmap.CameraMode.PER_IMAGE, image_names=names)
     with pycolmap.Database.open(out) as database:
-        for image in images:
-            row = database.read_image_with_name(image.name)
-            assert row is not None
-            number = row.image_id
-            database.write_keypoints(number, image.keypoints)
+        numbers = {row.name: row.image_id for row in database.read_all_images()}
+        unread = [name for name in names if name not in numbers]
+        for image in images if not unread else ():
+            database.write_keypoints(numbers[image.name], image.keypoints)
             kinds = pycolmap.FeatureExtractorType
             kind = kinds.SIFT if image.descriptors.shape[1] == SIFT else kinds.UNDEFINED
-            database.write_descriptors(number, pycolmap.FeatureDescriptors(kind, _quantise(image.descriptors)))
+            database.write_descriptors(numbers[image.name], pycolmap.FeatureDescriptors(kind, _quantise(image.descriptors)))
+    if unread:
+        out.unlink()
+        raise UserError(f"{unread[0]}: COLMAP cannot read this image; convert it to PNG or JPEG, or give --layout hloc")
 
 
 LAYOUTS: Mapping[str, Callable[[Sequence[ImageFeatures], Path], None]] = {"hloc": write_hloc, "colmap": write_colmap}

@@ -207,7 +207,7 @@ def _extract_image(extractor: Extractor, image: ImageSource) -> ExtractedImage:
         with wrap_plugin_errors("the reader of photographs"):
             pixels, notes = samples.read_pixels(image)
         with wrap_plugin_errors(f"plugin {extractor.name()}"):
-            features = extractor.extract(pixels, image.path)
+            features = extractor.extract(pixels, image)
         read = functools.partial(_same, pixels)
     else:
         with wrap_plugin_errors(f"plugin {extractor.name()}"):

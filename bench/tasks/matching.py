@@ -14,7 +14,7 @@ Without any match all are zero. Sources: Mikolajczyk and Schmid, PAMI 2005; Dusm
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -26,6 +26,7 @@ from bench.codebook.public import Public
 from bench.core import hashing
 from bench.core.errors import SampleError, UserError
 from bench.images.samples import Collection, Images, Sample
+from bench.images.scene import File, Pixels
 from bench.localization import two_view_matching
 from bench.rendering import homographies
 from bench.rendering.homographies import Pair
@@ -65,7 +66,10 @@ class Matching(Task):
             return _build_collection("pairs", homographies.create_pairs(SEED, self.each))
         if not isinstance(images, (str, Path)):
             raise UserError("matching takes pairs of images; give a folder of HPatches")
-        return _build_collection(Path(images).resolve().name, homographies.load_hpatches(Path(images)))
+        root = Path(images)
+        pairs = homographies.load_hpatches(root)
+        named = [replace(pair, first=_name_file(pair.first, root), second=_name_file(pair.second, root)) for pair in pairs]
+        return _build_collection(root.resolve().name, named)
 
     def explain_not_applicable(self, defense: Defense, attack: Attack | None, extractor: Extractor, public: Public) -> str | None:
         if issubclass(defense.releases, (Descriptors, Subspaces, WordSets)):
@@ -87,6 +91,11 @@ class Matching(Task):
         )
         matches = two_view_matching.match_releases(query.release, second, self.ratio)
         return Outcome(metrics=compute_accuracy(query.release.keypoints, second.keypoints, pair.homography, matches))
+
+
+def _name_file(image: Pixels, root: Path) -> Pixels:
+    """Return the image with its file's name below `root`, by which stored features are found."""
+    return replace(image, name=image.path.relative_to(root).as_posix()) if isinstance(image, File) else image
 
 
 def compute_accuracy(first: Floats, second: Floats, homography: Doubles, matches: Indices) -> dict[str, float | None]:

@@ -1,6 +1,7 @@
 """Exchange with hloc, COLMAP, kornia and TensorBoard; the folders of MegaDepth and HPatches."""
 
 import builtins
+import os
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 import torch
 from fakes import draw_texture, write_album
 from PIL import Image
+from PIL import features as image_features
 
 from bench import cli
 from bench.codebook.examples import write_dictionary
@@ -22,6 +24,7 @@ from bench.extractors.sift import Sift
 from bench.formats import pairs as hloc_pairs
 from bench.formats.stored_features import map_into_square, map_out_of_square
 from bench.images import photographs
+from bench.images.photographs import Source
 from bench.testing import check_extractor
 
 kornia = pytest.importorskip("kornia")
@@ -58,7 +61,7 @@ def test_features_exported_to_hloc_are_read_again(images: Path, tmp_path: Path) 
     assert export("--images", images, "--layout", "hloc", "--out", out, "--pairs", pairs) == 0
     path = images / "street" / "a.png"
     pixels = photographs.read(path).pixels
-    ours, back = Sift().extract(pixels), Hloc(path=out).extract(pixels, path)
+    ours, back = Sift().extract(pixels), Hloc(path=out).extract(pixels, Source("street/a.png", path))
     np.testing.assert_allclose(back.keypoints, ours.keypoints, atol=1e-3)
     np.testing.assert_allclose(back.descriptors, ours.descriptors, atol=1e-6)
     with h5py.File(out) as opened:
@@ -105,6 +108,56 @@ def test_invalid_arguments_of_export(images: Path, tmp_path: Path, capfd: pytest
     assert not (tmp_path / "x").exists()
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("layout", ["hloc", "colmap"])
+def test_pairs_are_refused_before_anything_is_written(
+    images: Path, tmp_path: Path, layout: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    out, pairs = tmp_path / "out", tmp_path / "pairs.txt"
+    (images / "b.png").rename(images / "b c.png")
+    assert export("--images", images, "--layout", layout, "--out", out, "--pairs", pairs) == 2
+    assert "'b c.png': a list of pairs cannot hold a name with a space in it" in capfd.readouterr().err
+    assert export("--images", images, "--layout", layout, "--out", out, "--pairs", out) == 2
+    assert "the same file as --out" in capfd.readouterr().err
+    assert not out.exists()
+    assert not pairs.exists()
+    assert export("--images", images, "--layout", layout, "--out", out) == 0  # without a list the name is allowed
+    path = images / "b c.png"
+    back = (Hloc if layout == "hloc" else ColmapDatabase)(path=out).extract(
+        photographs.read(path).pixels, Source("b c.png", path)
+    )
+    assert len(back) == len(Sift().extract(photographs.read(path).pixels))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("layout", ["hloc", "colmap"])
+def test_names_that_are_not_utf8_fail_alone(images: Path, tmp_path: Path, layout: str, capfd: pytest.CaptureFixture[str]) -> None:
+    (images / "b.png").rename(Path(os.fsdecode(os.fsencode(images) + b"/caf\xe9.png")))
+    out, pairs = tmp_path / "out", tmp_path / "pairs.txt"
+    assert export("--images", images, "--layout", layout, "--out", out, "--pairs", pairs) == 1
+    assert r"'caf\udce9.png': this name is not UTF-8; rename the file" in capfd.readouterr().err
+    path = images / "street" / "a.png"
+    back = (Hloc if layout == "hloc" else ColmapDatabase)(path=out).extract(
+        photographs.read(path).pixels, Source("street/a.png", path)
+    )
+    assert len(back) == len(Sift().extract(photographs.read(path).pixels))
+    with pytest.raises(SampleError, match="this name is not UTF-8"):
+        (Hloc if layout == "hloc" else ColmapDatabase)(path=out).extract(
+            photographs.read(path).pixels, Source("caf\udce9.png", path)
+        )
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not image_features.check("avif"), reason="this Pillow cannot write AVIF")
+def test_images_that_colmap_cannot_read_leave_no_database(
+    images: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    draw_texture(0, (300, 200)).save(images / "c.avif")
+    assert export("--images", images, "--layout", "colmap", "--out", tmp_path / "out.db") == 2
+    assert "c.avif: COLMAP cannot read this image; convert it to PNG or JPEG" in capfd.readouterr().err
+    assert list(tmp_path.iterdir()) == [images]
+
+
 # ---- COLMAP
 
 
@@ -121,12 +174,12 @@ def test_exported_database_is_read_by_colmap_and_by_us(images: Path, tmp_path: P
         assert database.num_frames() == database.num_images() == 2  # as its incremental mapper wants them
     assert (camera.width, camera.height) == (300, 200)
     np.testing.assert_allclose(xy[:, :2], ours.keypoints * (200 / 256) + [50, 0], atol=1e-3)
-    back = ColmapDatabase(path=out).extract(pixels, path)
+    back = ColmapDatabase(path=out).extract(pixels, Source("street/a.png", path))
     np.testing.assert_allclose(back.keypoints, ours.keypoints, atol=1e-3)
     assert back.codes is not None
     assert ours.codes is not None
     np.testing.assert_allclose(back.codes.astype(int), ours.codes.astype(int), atol=2)  # SIFT's norm is 512 but for rounding
-    check_extractor(ColmapDatabase(path=out), pixels, path)
+    check_extractor(ColmapDatabase(path=out), pixels, Source("street/a.png", path))
 
 
 def test_features_of_colmap_are_read(tmp_path: Path) -> None:
@@ -136,7 +189,7 @@ def test_features_of_colmap_are_read(tmp_path: Path) -> None:
     out = tmp_path / "database.db"
     pycolmap.extract_features(out, root, device=pycolmap.Device.cpu)
     path = root / "0.png"
-    found = ColmapDatabase(path=out).extract(photographs.read(path).pixels, path)
+    found = ColmapDatabase(path=out).extract(photographs.read(path).pixels, Source("0.png", path))
     with pycolmap.Database.open(out) as database:
         image = database.read_image_with_name("0.png")
         assert len(found) == database.num_keypoints_for_image(image.image_id)
@@ -154,10 +207,10 @@ def test_unusable_databases(images: Path, tmp_path: Path) -> None:
     unrelated = tmp_path / "unrelated.png"
     draw_texture(9, (300, 200)).save(unrelated)
     with pytest.raises(SampleError, match="no image of that name"):
-        ColmapDatabase(path=out).extract(photographs.read(unrelated).pixels, unrelated)
+        ColmapDatabase(path=out).extract(photographs.read(unrelated).pixels, Source("unrelated.png", unrelated))
     draw_texture(9, (100, 200)).save(images / "b.png")
     with pytest.raises(SampleError, match="the photograph has"):
-        ColmapDatabase(path=out).extract(photographs.read(images / "b.png").pixels, images / "b.png")
+        ColmapDatabase(path=out).extract(photographs.read(images / "b.png").pixels, Source("b.png", images / "b.png"))
     with pytest.raises(UserError, match="this image has none"):
         ColmapDatabase(path=out).extract(np.zeros((256, 256, 3), np.uint8))
 

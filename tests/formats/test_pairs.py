@@ -47,3 +47,15 @@ def test_names_with_spaces_are_not_written(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"'a b\.png': a list of pairs cannot hold a name with a space"):
         pairs.write(tmp_path / "new.txt", pairs.pair_all(["a b.png", "c.png"]))
     assert not (tmp_path / "new.txt").exists()
+
+
+@pytest.mark.parametrize("name", ["#1.png", "caf\udce9.png"])
+def test_names_that_a_list_cannot_hold_are_not_written(tmp_path: Path, name: str) -> None:
+    with pytest.raises(UserError, match="a list of pairs cannot hold a name that begins with #, or is not UTF-8"):
+        pairs.write(tmp_path / "new.txt", {"a.png": [name]})
+    assert not (tmp_path / "new.txt").exists()
+
+
+def test_byte_order_mark_is_ignored(tmp_path: Path) -> None:
+    (tmp_path / "pairs.txt").write_text("a.png b.png\n", encoding="utf-8-sig")
+    assert pairs.read(tmp_path / "pairs.txt") == {"a.png": ["b.png"]}

@@ -1,15 +1,20 @@
 """Reading of photographs, and the error for each kind of invalid file."""
 
+import logging
+import os
+import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
 from fakes import draw_texture, write_album
-from PIL import Image
+from PIL import Image, ImageOps, features
 
 from bench.core.errors import SampleError, UserError
 from bench.extractors.sift import Sift
+from bench.formats.stored_features import read_upright_size
 from bench.images import photographs
+from bench.images.photographs import Source
 
 
 def save(path: Path, image: Image.Image, **options: object) -> Path:
@@ -42,8 +47,67 @@ def test_folder_is_sorted_and_finds_subfolders(tmp_path: Path) -> None:
     assert [source.name for source in photographs.list_photographs(tmp_path)] == ["a/0.png", "b.JPG"]
 
 
+def list_names(folder: Path) -> list[str]:
+    return [source.name for source in photographs.list_photographs(folder)]
+
+
+@pytest.mark.parametrize("suffix", [".bmp", ".jfif", ".tif", ".TIFF", ".png", ".webp", ".avif"])
+def test_formats_are_listed_and_read(tmp_path: Path, suffix: str) -> None:
+    if suffix == ".avif" and not features.check("avif"):
+        pytest.skip("this Pillow cannot read AVIF")
+    texture = draw_texture(0)
+    path = save(tmp_path / f"a{suffix}", texture, **({"format": "JPEG"} if suffix == ".jfif" else {}))
+    assert list_names(tmp_path) == [path.name]
+    expected = photographs.crop_square(texture, 256).astype(int)
+    assert np.abs(photographs.read(path).pixels - expected).mean() < (1 if suffix in (".bmp", ".tif", ".TIFF", ".png") else 20)
+
+
+def test_linked_folders_and_files_are_read_under_their_own_names(tmp_path: Path) -> None:
+    elsewhere, folder = write_album(tmp_path / "elsewhere", 1), tmp_path / "photos"
+    write_album(elsewhere / "deeper", 1)
+    (folder / "real").mkdir(parents=True)
+    (folder / "link").symlink_to(elsewhere, target_is_directory=True)
+    (folder / "a.png").symlink_to(elsewhere / "0.png")
+    assert list_names(folder) == ["a.png", "link/0.png", "link/deeper/0.png"]
+
+
+def test_circular_links_end(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_album(tmp_path / "a", 1)
+    (tmp_path / "a" / "up").symlink_to(tmp_path, target_is_directory=True)
+    (tmp_path / "self").symlink_to("self", target_is_directory=True)
+    assert list_names(tmp_path) == ["a/0.png"]
+    assert "left out: a/up (a link to a folder that contains it)" in caplog.text
+
+
+def test_one_line_names_what_is_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_album(tmp_path, 1)
+    (tmp_path / "._0.png").write_bytes(b"\x00\x05\x16\x07")
+    for number in range(5):
+        (tmp_path / f"{number}.HEIC").write_bytes(b"x")
+    (tmp_path / "absent.png").symlink_to("nowhere.png")
+    os.mkfifo(tmp_path / "pipe.png")
+    (tmp_path / "line\nbreak.gif").write_bytes(b"x")
+    (tmp_path / "notes.txt").write_text("no photograph")
+    assert list_names(tmp_path) == list_names(tmp_path) == ["0.png"]
+    (record,) = caplog.records
+    assert record.levelno == logging.WARNING
+    assert record.getMessage() == f"--images {tmp_path}: left out: " + "; ".join(
+        [
+            "'line\\nbreak.gif' (GIF is not read; convert it to PNG or JPEG)",
+            "0.HEIC, 1.HEIC, 2.HEIC, 2 more (HEIC is not read; convert it to PNG or JPEG)",
+            "._0.png (a resource fork of macOS)",
+            "absent.png, pipe.png (no file, or a broken link)",
+        ]
+    )
+
+
+def test_complete_folders_are_listed_silently(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    list_names(write_album(tmp_path, 2))
+    assert caplog.records == []
+
+
 def test_empty_and_missing_folders(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match=r"no photograph in it \(looked for \.jpeg, \.jpg, \.png, \.ppm, \.webp\)"):
+    with pytest.raises(UserError, match=r"no photograph in it \(looked for \.avif, \.bmp, \.jfif, \.jpeg, .*\)"):
         photographs.list_photographs(tmp_path)
     with pytest.raises(UserError, match="no such folder"):
         photographs.list_photographs(tmp_path / "absent")
@@ -105,6 +169,73 @@ def test_exif_rotation_is_applied(tmp_path: Path) -> None:
     assert read[:, :50].max() < 50
 
 
+@pytest.mark.parametrize("orientation", range(10))
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".tif", ".webp"])
+def test_orientations_agree_with_pillow(tmp_path: Path, orientation: int, suffix: str) -> None:
+    """`upright=False` is the image as stored: COLMAP, hloc and intrinsics refer to it."""
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    texture = draw_texture(0, (80, 64))
+    options = {"lossless": True} if suffix == ".webp" else {"quality": 95} if suffix == ".jpg" else {}
+    path = save(tmp_path / f"a{suffix}", texture, exif=exif, **options)
+    upright, _ = photographs.decode(path)
+    with Image.open(path) as opened:
+        expected = ImageOps.exif_transpose(opened).convert("RGB")
+    assert np.array_equal(np.asarray(upright), np.asarray(expected))
+    stored, _ = photographs.decode(path, upright=False)
+    assert stored.size == (80, 64)
+    assert np.abs(np.asarray(stored).astype(int) - np.asarray(texture)).mean() < (5 if suffix == ".jpg" else 0.1)
+    if orientation in range(2, 9):
+        with pytest.raises(SampleError, match="EXIF rotation"):
+            read_upright_size(Source(path.name, path), (80, 64))
+    else:
+        assert read_upright_size(Source(path.name, path), (80, 64)) == (80, 64)
+
+
+def build_exif(orientation: int, *rational: int) -> bytes:
+    """EXIF data with an orientation and a signed rational number in place of the resolution."""
+    entries = struct.pack("<HHI", 0x112, 3, 1) + struct.pack("<HH", orientation, 0) + struct.pack("<HHII", 0x11A, 10, 1, 38)
+    head = b"Exif\0\0II*\0" + struct.pack("<I", 8) + struct.pack("<H", 2)
+    return head + entries + struct.pack("<I", 0) + struct.pack("<ii", *rational)
+
+
+@pytest.mark.parametrize("rational", [(-1, 0), (0, 0), (1, -1), (-(2**31), -1)])
+def test_odd_numbers_in_exif_do_no_harm(tmp_path: Path, rational: tuple[int, int]) -> None:
+    pixels = np.zeros((64, 64, 3), np.uint8)
+    pixels[:32] = 255  # the top half is white
+    for name in ("a.jpg", "a.png", "a.webp"):
+        path = save(tmp_path / name, Image.fromarray(pixels), exif=build_exif(6, *rational))
+        read = photographs.read(path).pixels
+        assert read[:, 200:].min() > 200
+        assert read[:, :50].max() < 50
+
+
+@pytest.mark.parametrize("exif", [b"Exif\0\0", b"Exif\0\0II*\0\xff\xff\xff\xff", b"Exif\0\0garbage", build_exif(6, 1, 1)[:20]])
+def test_damaged_exif_does_no_harm(tmp_path: Path, exif: bytes) -> None:
+    path = save(tmp_path / "a.png", draw_texture(0), exif=exif)
+    assert np.array_equal(photographs.read(path).pixels, photographs.crop_square(draw_texture(0), 256))
+    assert read_upright_size(Source("a.png", path)) == (80, 64)
+
+
+def test_first_page_of_a_tiff_file_is_read_with_a_note(tmp_path: Path) -> None:
+    first, second = draw_texture(0), draw_texture(1)
+    path = save(tmp_path / "a.tif", first, save_all=True, append_images=[second])
+    found = photographs.read(path)
+    assert np.array_equal(found.pixels, photographs.crop_square(first, 256))
+    assert found.notes == ("a.tif: 2 pages, of which the first is read",)
+
+
+@pytest.mark.parametrize("values", [np.linspace(0, 1, 4096), np.full(4096, -1.0)])
+def test_values_without_a_range_are_refused(tmp_path: Path, values: np.ndarray) -> None:
+    """A photograph between 0 and 1 would otherwise be black."""
+    floats = Image.fromarray(values.reshape(64, 64).astype(np.float32))
+    with pytest.raises(SampleError, match=r"floats\.tif: its pixels are floating-point numbers of no defined range"):
+        photographs.read(save(tmp_path / "floats.tif", floats))
+    whole = Image.fromarray((values * 100_000).reshape(64, 64).astype(np.int32))
+    with pytest.raises(SampleError, match=r"whole\.tif: its pixels are not between 0 and 65535"):
+        photographs.read(save(tmp_path / "whole.tif", whole))
+
+
 def test_transparency_is_composited_over_white(tmp_path: Path) -> None:
     clear = Image.new("RGBA", (64, 64), (255, 0, 0, 0))
     palette = Image.new("P", (64, 64), 3)
@@ -133,6 +264,11 @@ def test_validation_set(tmp_path: Path) -> None:
     assert [source.name for source in validation] == ["1.png", "3.png"]
     assert [source.name for source in photographs.split_validation(sources, None)[1]] == ["0.png"]
     assert photographs.split_validation(sources, write_album(tmp_path / "others", 1))[0] == sources
+    names.write_text("1.png\n3.png\n", encoding="utf-8-sig")
+    assert [source.name for source in photographs.split_validation(sources, names)[1]] == ["1.png", "3.png"]
+    names.write_bytes(b"caf\xe9.png")
+    with pytest.raises(UserError, match="not a text file"):
+        photographs.split_validation(sources, names)
     names.write_text("absent.png")
     with pytest.raises(UserError, match="names none"):
         photographs.split_validation(sources, names)

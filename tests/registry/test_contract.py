@@ -17,6 +17,7 @@ from bench.extractors.sift import Sift
 from bench.formats import tensor_file
 from bench.geometry.nearest_words import unit_rows
 from bench.images import photographs
+from bench.images.photographs import Source
 from bench.registry import discovery, fields, spec
 from bench.registry.discovery import Kind
 from bench.testing import check_applicability, check_attack, check_defense, check_extractor, check_metric
@@ -109,7 +110,7 @@ def test_wrong_defense_is_detected(defense: Defense, complaint: str) -> None:
 
 def test_extractor_with_keypoints_in_order_of_response_is_detected() -> None:
     class Ranked(Sift):
-        def extract(self, image: np.ndarray, source: Path | None = None) -> Features:
+        def extract(self, image: np.ndarray, source: Source | None = None) -> Features:
             features = super().extract(image, source)
             return dataclasses.replace(
                 features, keypoints=features.keypoints[::-1], descriptors=features.descriptors[::-1], codes=features.codes[::-1]

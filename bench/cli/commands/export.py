@@ -36,7 +36,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def execute(args: argparse.Namespace) -> int:
     from bench.core.errors import SampleError
     from bench.core.progress import Progress
-    from bench.formats import pairs
+    from bench.formats import lists, pairs
     from bench.registry import discovery, spec
     from bench.runner import feature_export
     from bench.runner.plan import RunConfiguration, build_plan
@@ -57,6 +57,10 @@ def execute(args: argparse.Namespace) -> int:
         seed=args.seed,
     )
     plan = build_plan(configuration)
+    if args.pairs is not None:
+        if args.pairs.absolute() == args.out.absolute():
+            raise UserError(f"--pairs {args.pairs}: the same file as --out; give another")
+        pairs.check_names(sample.name for sample in plan.samples if lists.is_utf8(sample.name))  # others fail below
     (experiment,) = plan.experiments
     if attack is not None and experiment.reason is not None:
         raise UserError(experiment.reason)
