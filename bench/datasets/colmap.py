@@ -11,6 +11,7 @@ The folder contains
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass
@@ -20,6 +21,7 @@ from typing import TYPE_CHECKING, get_args
 import numpy as np
 
 from bench.api import Dataset
+from bench.core import paths
 from bench.core.errors import UserError
 from bench.formats import lists
 from bench.images.scene import Condition, File, Reference, Scene, SceneImage
@@ -180,11 +182,16 @@ def _read_poses(path: Path) -> dict[str, tuple[str, pycolmap.Rigid3d]]:
 
 
 def _find_image(name: str, where: str, camera: pycolmap.Camera, images: Path, masks: Path | None) -> File:
-    path = images / name
-    if not path.is_file():
+    try:
+        path = paths.find_file(images, name)
+        mask = None if masks is None else paths.find_file(masks, name).with_suffix(".png")
+    except UserError as error:
+        raise UserError(f"{where}: {error}") from None
+    if not os.path.isfile(path):
         raise UserError(f"{where}: there is no image {path}")
-    mask = None if masks is None else (masks / name).with_suffix(".png")
-    return File(path=path, size=(camera.width, camera.height), mask=mask if mask is not None and mask.is_file() else None)
+    return File(
+        path=path, size=(camera.width, camera.height), mask=mask if mask is not None and os.path.isfile(mask) else None
+    )
 
 
 PLUGIN = Colmap

@@ -7,6 +7,7 @@ running jobs. The lock on the records shows whether their process runs: the oper
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
 import socket
@@ -16,7 +17,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
-from bench.core.errors import UserError
+from bench.core import paths
+from bench.core.errors import SampleError, UserError
 from bench.runner.records import Record, key
 
 if TYPE_CHECKING:
@@ -25,6 +27,8 @@ if TYPE_CHECKING:
     from bench.runner.trial import Result
 
 ERRORS = "errors.log"
+# Errors of one path, and not of the disk: the name is too long for the system, or a file has the name of a folder.
+ERRORS_OF_NAMES = {errno.ENAMETOOLONG, errno.EINVAL, errno.EILSEQ, errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ELOOP}
 PLAN = "plan.json"
 RUNNING = "running.json"
 METADATA = ("task", "defense", "attack", "dataset", "seed", "experiment_id", "run_hash")  # of an experiment, in the plan's file
@@ -32,13 +36,19 @@ METADATA = ("task", "defense", "attack", "dataset", "seed", "experiment_id", "ru
 
 def reconstruction_path(out: Path, record: Record) -> Path:
     """Return the path of a record's reconstruction. For records of schema 1 the folder is `cell_id`."""
-    return out / "reconstructions" / str(record.get("cell_id", record["experiment_id"])) / f"{record['sample']}.png"
+    experiment = paths.place_file(out / "reconstructions", str(record.get("cell_id", record["experiment_id"])))
+    return paths.place_file(experiment, record["sample"], ".png")
 
 
 def photograph_path(out: Path, record: Record) -> Path:
     """Return the path of a record's photograph, as it was attacked. Its folder is a hash: datasets can have equal names."""
     content = record["dataset"]["hash"].removeprefix("sha256:")[:16]
-    return out / "photographs" / content / f"{record['sample']}.png"
+    return paths.place_file(paths.place_file(out / "photographs", content), record["sample"], ".png")
+
+
+def figure_path(out: Path, sample: str) -> Path:
+    """Return the path of the figure with all reconstructions of a sample."""
+    return paths.place_file(out / "figures", sample, ".png")
 
 
 def write_result(result: Result, out: Path) -> None:
@@ -46,19 +56,30 @@ def write_result(result: Result, out: Path) -> None:
 
     Raises
     ------
+    SampleError
+        if the system does not accept the path of one of them.
     OSError
-        if one cannot be written.
+        if one cannot be written, for example to a full disk.
     """
     for content, path in (
         (result.reconstruction, reconstruction_path(out, result.record)),
         (result.photograph, photograph_path(out, result.record)),
     ):
         if content is not None:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(content)
+            _write_picture(path, content)
     if result.trace is not None:
-        with (out / ERRORS).open("a", encoding="utf-8") as log:
+        with (out / ERRORS).open("a", encoding="utf-8", errors="backslashreplace") as log:
             log.write(f"{result.record['sample']}\n{result.trace}\n")
+
+
+def _write_picture(path: Path, content: bytes) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+    except OSError as error:
+        if error.errno not in ERRORS_OF_NAMES:
+            raise
+        raise SampleError(f"its picture cannot be written to {path}: {error.strerror}") from error
 
 
 def write_plan(out: Path, plans: Sequence[Plan]) -> None:

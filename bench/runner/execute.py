@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 from bench.api import Attack, Dataset, Defense, Extractor, Metric
+from bench.core.errors import SampleError
 from bench.images.samples import Images
 from bench.registry import discovery, spec
 from bench.runner import directory, records, trial
@@ -96,10 +97,14 @@ def execute(plans: Sequence[Plan], out: Path | None = None, engine: Engine = IN_
         yield from resumed
         with directory.RunningJobs(out, engine.name) as running:
             for result in _run_missing(plans, set(map(records.key, resumed)), engine, running.track):
-                directory.write_result(result, out)
-                log.append(result.record)
-                running.remove(result.record)
-                yield result.record
+                record = result.record
+                try:
+                    directory.write_result(result, out)
+                except SampleError as error:
+                    record = trial.fail(record, str(error))
+                log.append(record)
+                running.remove(record)
+                yield record
 
 
 def sort_records(plans: Sequence[Plan], unsorted: Iterable[Record]) -> list[Record]:

@@ -3,6 +3,7 @@
 import copy
 import gc
 import json
+import os
 import re
 import shutil
 import weakref
@@ -36,6 +37,7 @@ from bench.threat_model import DefenseDatabase, PublicDatabase, ServerMap
 from defenses.affine import Affine
 from defenses.ldp import LDP
 from defenses.none import Undefended
+from leaderboard import run_report
 
 RECONSTRUCTION = Reconstruction(inverter="sketch")
 
@@ -222,6 +224,42 @@ def test_unreadable_photograph_is_a_failed_record_and_the_others_are_run(images:
     assert "no keypoint" in records[6]["reason"]
     assert records[2]["privacy"]["epsilon_image"] is None
     assert records[2]["privacy"]["epsilon_image_optimal"] is None
+
+
+@pytest.mark.slow
+def test_odd_names_of_photographs_end_no_run(images: Path, tmp_path: Path) -> None:
+    texture = (images / "0.png").read_bytes()
+    (images / "x.png.png").mkdir()
+    names = ["m" + "x" * 250 + ".png", "nul.png", "x.png", "x.png.png/y.png", os.fsdecode(b"caf\xe9.png")]
+    for number, name in enumerate(names):
+        (images / name).write_bytes(texture + bytes([number]))  # photographs of one content would share a release
+    out = tmp_path / "out"
+    records = run([Undefended()], [Sketch()], images, out=out)
+    assert [record["status"] for record in records] == ["ok"] * 7
+    assert {record["sample"] for record in records} == {*names, "0.png", "1.png"}
+    assert all(directory.reconstruction_path(out, record).is_file() for record in records)
+    assert all(directory.photograph_path(out, record).is_file() for record in records)
+    assert len(list((out / "reconstructions").rglob("*.png"))) == 7 + 1  # the folder x.png.png is not one of them
+    run_report.write(records, out, "bench run")
+    assert all(directory.figure_path(out, record["sample"]).is_file() for record in records)
+    before = (out / FILE).read_bytes()
+    assert run([Undefended()], [Sketch()], images, out=out) == records  # it can be resumed
+    assert (out / FILE).read_bytes() == before
+
+
+def test_a_picture_that_cannot_be_written_fails_its_sample_alone(images: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    whole = run([Undefended()], [Sketch()], images)
+    taken = directory.reconstruction_path(out, whole[0])
+    taken.mkdir(parents=True)  # a folder in its place
+    records = run([Undefended()], [Sketch()], images, out=out)
+    assert [record["status"] for record in records] == ["failed", "ok"]
+    assert "picture cannot be written" in records[0]["reason"]
+    assert records[0]["metrics"] == {}
+    assert records[0]["privacy"]["keypoints"] is None
+    assert [line["status"] for line in map(json.loads, (out / FILE).read_text().splitlines())] == ["failed", "ok"]
+    taken.rmdir()
+    assert judged(run([Undefended()], [Sketch()], images, out=out)) == judged(whole)
 
 
 def test_broken_plugin_fails_its_own_experiments_and_leaves_a_traceback(images: Path, tmp_path: Path) -> None:
