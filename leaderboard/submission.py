@@ -18,6 +18,7 @@ import numpy as np
 
 from bench.api import Plugin
 from bench.codebook.public import ASSETS, REFERENCES, SHIPPED
+from bench.core import strict_json
 from bench.core.errors import SampleError, UserError
 from bench.core.progress import Progress
 from bench.images.photographs import list_photographs
@@ -106,9 +107,9 @@ def _parse_lines(texts: Sequence[bytes]) -> Iterator[NumberedRecord | Fault]:
     }
     for number, text in enumerate(texts, start=1):
         try:
-            record = json.loads(text, parse_constant=_refuse)
+            record = strict_json.parse(text)
         except ValueError as error:
-            yield Fault(number, f"not valid JSON: {error}")
+            yield Fault(number, _shorten(error))
             continue
         version = record.get("schema") if isinstance(record, dict) else None
         validator = validators[version if version == 1 else records.SCHEMA]
@@ -116,23 +117,10 @@ def _parse_lines(texts: Sequence[bytes]) -> Iterator[NumberedRecord | Fault]:
         for violation in errors:
             part = violation.json_path.removeprefix("$").lstrip(".") or "the record"
             yield Fault(number, f"{part}: {_shorten(violation.message)}")
-        if not errors and (unbounded := _find_non_finite(record)):
-            yield Fault(number, f"{unbounded}: not finite")
-        elif not errors:
+        if not errors:
             if (fault := records.explain_invalid(record)) is not None:
                 yield Fault(number, fault)
             yield NumberedRecord(number, records.upgrade(record))
-
-
-def _refuse(constant: str) -> None:
-    raise ValueError(f"{constant} is not a number of JSON")
-
-
-def _find_non_finite(value: Any, path: str = "") -> str | None:
-    """Return the path of a number that JSON can express and a double cannot, such as 1e999; None if there is none."""
-    if isinstance(value, dict):
-        return next((part for name, inner in value.items() if (part := _find_non_finite(inner, f"{path}.{name}"))), None)
-    return path.lstrip(".") if isinstance(value, float) and not math.isfinite(value) else None
 
 
 def _check_consistency(record: Record) -> Iterator[str]:

@@ -189,9 +189,7 @@ def _find_image(name: str, where: str, camera: pycolmap.Camera, images: Path, ma
         raise UserError(f"{where}: {error}") from None
     if not os.path.isfile(path):
         raise UserError(f"{where}: there is no image {path}")
-    return File(
-        path=path, size=(camera.width, camera.height), mask=mask if mask is not None and os.path.isfile(mask) else None
-    )
+    return File(path=path, size=(camera.width, camera.height), mask=mask if mask is not None and os.path.isfile(mask) else None)
 
 
 PLUGIN = Colmap

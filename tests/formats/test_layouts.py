@@ -388,7 +388,7 @@ def test_nothing_is_overwritten(original: Scene, written: dict[str, Path], tmp_p
 
 
 @pytest.mark.parametrize("layout", LOADERS)
-@pytest.mark.parametrize("name", ["../x.png", "a/../../../x.png", "/tmp/x.png"])
+@pytest.mark.parametrize("name", ["../x.png", "a/../../../x.png", "/srv/x.png"])
 def test_no_image_is_written_outside_the_folder(original: Scene, tmp_path: Path, layout: str, name: str) -> None:
     queries = (*original.queries[:-1], dataclasses.replace(original.queries[-1], name=name))
     with pytest.raises(UserError, match="expected a name of a file below"):
