@@ -57,6 +57,7 @@ class Contents:
     """Contents of a file of records."""
 
     records: list[Record]
+    numbers: list[int]  # of their lines, counted from 1
     whole: int  # bytes up to the end of the last whole line
     notice: str | None = None  # a warning about an incomplete last line
 
@@ -73,10 +74,11 @@ def read(path: Path) -> Contents:
         if another line is no record, or was changed after it was written; the message names file and line.
     """
     *lines, rest = path.read_bytes().split(b"\n")
-    contents = [_parse(path, number, line) for number, line in enumerate(lines, start=1) if line.strip()]
+    numbers = [number for number, line in enumerate(lines, start=1) if line.strip()]
+    contents = [_parse(path, number, lines[number - 1]) for number in numbers]
     whole = sum(len(line) + 1 for line in lines)
     notice = f"{path}: the last line was cut off and is skipped" if rest else None
-    return Contents(contents, whole, notice)
+    return Contents(contents, numbers, whole, notice)
 
 
 def keep_latest(records: Iterable[Record]) -> list[Record]:
