@@ -6,7 +6,7 @@ from decimal import Decimal, DecimalException
 from fractions import Fraction
 
 INFINITE = ("inf", "infinity")
-# Decimal exponents of the least and the greatest double. A fraction beyond them may not fit into memory, so they are tested first.
+# Decimal exponents of the least and the greatest double. They are tested first: a fraction beyond them may not fit into memory.
 LEAST, GREATEST = -324, 308
 
 

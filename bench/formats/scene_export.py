@@ -28,7 +28,7 @@ def write(scene: Scene, layout: str, out: Path) -> None:
     Raises
     ------
     UserError
-        if the folder is not empty, the layout is unknown, the layout cannot represent the scene, or a name leads out of the folder.
+        if the folder is not empty, a name leads out of it, the layout is unknown, or the layout cannot represent the scene.
     """
     if layout not in LAYOUTS:
         raise UserError(f"--layout {layout}: unknown layout; available: {', '.join(LAYOUTS)}")
