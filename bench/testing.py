@@ -162,7 +162,8 @@ def check_metric(metric: Metric, seed: int = 0) -> None:
     _require(np.array_equal(truth, before[0]), "changed the truth")
     _require(np.array_equal(estimate, before[1]), "changed the estimate")
     low, high = metric.range
-    _require(isinstance(value, float), "the value is not a float")
+    if not isinstance(value, float):
+        raise AssertionError("the value is not a float")
     _require(low <= value <= high, "the value is outside the declared range")
     _require(perfect is None or low <= perfect <= high, "the value of the truth is outside the declared range")
     best = (high if metric.higher_is_better_for == "attacker" else low) if perfect is None else perfect

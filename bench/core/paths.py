@@ -1,6 +1,6 @@
 """Paths of names that come from outside: images in lists and models, samples, entries of records.
 
-A name may hold folders, separated by `/`. `find_file` is for readers, `place_file` for writers. Neither leaves the folder.
+A name may hold folders, separated by `/`. `find_file` is for readers, `assign_path` for writers. Neither leaves the folder.
 """
 
 from __future__ import annotations
@@ -37,16 +37,16 @@ def find_file(folder: Path, name: str, windows: bool = os.name == "nt") -> Path:
     return folder / name
 
 
-def place_file(folder: Path, name: str, suffix: str = "") -> Path:
+def assign_path(folder: Path, name: str, suffix: str = "") -> Path:
     """Return the path below `folder` at which the file of a name is written. `suffix` is appended to the name.
 
     All names have a path that every system accepts, and two names never need the same one. A part of the name is replaced by its
     hash and its first letters if it is too long, leads out of the folder, has another meaning on Windows, is no UTF-8, looks
     replaced, or is a folder that ends as files do.
 
-    >>> place_file(Path("out"), "night/1.jpg", ".png").as_posix()
+    >>> assign_path(Path("out"), "night/1.jpg", ".png").as_posix()
     'out/night/1.jpg.png'
-    >>> place_file(Path("out"), "nul.jpg", ".png").as_posix()
+    >>> assign_path(Path("out"), "nul.jpg", ".png").as_posix()
     'out/e14d5453e48d0e48~nul.jpg.png'
     """
     *folders, last = name.split("/")

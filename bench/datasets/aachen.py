@@ -102,7 +102,7 @@ def write_evaluation(folder: Path, method: str, poses: Mapping[str, pycolmap.Rig
         if base in by_base:
             raise UserError(f"{name}: another query has the same basename {base}, by which the server identifies queries")
         by_base[base] = pose
-    path = paths.place_file(folder, f"Aachen_eval_{method}", ".txt")
+    path = paths.assign_path(folder, f"Aachen_eval_{method}", ".txt")
     localized = {base: pose for base, pose in by_base.items() if pose is not None}
     lists.write_poses(path, localized)
     return path, len(poses) - len(localized)

@@ -38,19 +38,19 @@ METADATA = ("task", "defense", "attack", "dataset", "seed", "experiment_id", "ru
 
 def reconstruction_path(out: Path, record: Record) -> Path:
     """Return the path of a record's reconstruction. For records of schema 1 the folder is `cell_id`."""
-    experiment = paths.place_file(out / "reconstructions", str(record.get("cell_id", record["experiment_id"])))
-    return paths.place_file(experiment, record["sample"], ".png")
+    experiment = paths.assign_path(out / "reconstructions", str(record.get("cell_id", record["experiment_id"])))
+    return paths.assign_path(experiment, record["sample"], ".png")
 
 
 def photograph_path(out: Path, record: Record) -> Path:
     """Return the path of a record's photograph, as it was attacked. Its folder is a hash: datasets can have equal names."""
     content = record["dataset"]["hash"].removeprefix("sha256:")[:16]
-    return paths.place_file(paths.place_file(out / "photographs", content), record["sample"], ".png")
+    return paths.assign_path(paths.assign_path(out / "photographs", content), record["sample"], ".png")
 
 
 def figure_path(out: Path, sample: str) -> Path:
     """Return the path of the figure with all reconstructions of a sample."""
-    return paths.place_file(out / "figures", sample, ".png")
+    return paths.assign_path(out / "figures", sample, ".png")
 
 
 def write_result(result: Result, out: Path) -> None:

@@ -250,9 +250,9 @@ def build_record(
 
 def fail(record: Record, reason: str) -> Record:
     """Return the record of a sample that failed after its evaluation."""
-    kept = {name: value for name, value in record.items() if name != "estimates"}
+    entries = {name: value for name, value in record.items() if name != "estimates"}
     privacy = record["privacy"] | dict.fromkeys(("keypoints", "epsilon_image", "epsilon_image_optimal"))
-    return seal(kept | {"status": "failed", "reason": reason, "metrics": {}, "privacy": privacy, "seconds": None})
+    return seal(entries | {"status": "failed", "reason": reason, "metrics": {}, "privacy": privacy, "seconds": None})
 
 
 def build_privacy(experiment: Experiment, keypoints: int | None) -> dict[str, Any]:

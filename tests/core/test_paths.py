@@ -42,12 +42,12 @@ ODD = [
 
 
 def list_targets(names: list[str], suffix: str = ".png") -> list[str]:
-    return [paths.place_file(Path("out"), name, suffix).as_posix() for name in names]
+    return [paths.assign_path(Path("out"), name, suffix).as_posix() for name in names]
 
 
 @pytest.mark.parametrize("name", ODD)
 def test_every_name_is_written_below_its_folder(tmp_path: Path, name: str) -> None:
-    path = paths.place_file(tmp_path / "out", name, ".png")
+    path = paths.assign_path(tmp_path / "out", name, ".png")
     path.parent.mkdir(parents=True)
     path.write_bytes(b"content")
     (written,) = (file for file in tmp_path.rglob("*") if file.is_file())
@@ -67,7 +67,7 @@ def test_usual_names_stay_as_they_are() -> None:
 
 def test_a_photograph_beside_a_folder_with_the_name_of_its_picture(tmp_path: Path) -> None:
     for name in ("x.png", "x.png.png/y.png", "x.png.png.png/z.png"):
-        path = paths.place_file(tmp_path, name, ".png")
+        path = paths.assign_path(tmp_path, name, ".png")
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(name.encode())
     assert len([file for file in tmp_path.rglob("*") if file.is_file()]) == 3

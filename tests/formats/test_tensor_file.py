@@ -167,6 +167,9 @@ def test_dictionaries_with_a_right_digest_and_wrong_content(
         dictionary.load(path)
 
 
+SETTINGS = weights.REQUIRED_METADATA[3]  # the name of the supported settings in files
+
+
 def change(**more: Any) -> Callable[[dict[str, Any]], dict[str, Any]]:
     return lambda meta: {**meta, **more}
 
@@ -180,10 +183,10 @@ def change(**more: Any) -> Callable[[dict[str, Any]], dict[str, Any]]:
         change(extractor=None),
         change(encoding="secret"),
         change(encoding=[]),
-        change(serves=[]),
-        change(serves={"epsilon": 5}),
-        change(serves={"epsilon": {"between": [1]}}),
-        change(serves={"epsilon": {"one_of": None}}),
+        change(**{SETTINGS: []}),
+        change(**{SETTINGS: {"epsilon": 5}}),
+        change(**{SETTINGS: {"epsilon": {"between": [1]}}}),
+        change(**{SETTINGS: {"epsilon": {"one_of": None}}}),
         change(slots="two"),
         change(shape={}),
         change(shape={"widths": 5}),
