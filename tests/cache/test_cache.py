@@ -1,6 +1,7 @@
 """Caches: entries are found by the hash of their inputs only, checked, and computed again if damaged."""
 
 import dataclasses
+import hashlib
 import json
 import os
 import resource
@@ -371,11 +372,18 @@ def test_a_damaged_header_is_detected_computed_again_and_pruned(
     assert not entry.path.exists()
 
 
-@pytest.mark.parametrize("sums", [b"", b"\xff\xfe\n", b"no-spaces\n", b"0  ../a/b\n", b"0  /etc/hostname\n", b"0  a\0b\n"])
+EMPTY = hashlib.sha256(b"").hexdigest().encode()
+
+
+@pytest.mark.parametrize(
+    "sums",
+    [b"", b"\xff\xfe\n", b"no-spaces\n", b"0  ../a/b\n", b"0  /etc/hostname\n", b"0  a\0b\n", EMPTY + b"  ../../outside\n"],
+)
 def test_damaged_checksums_of_a_folder_are_detected_and_pruned(
     cache_folder: Path, capfd: pytest.CaptureFixture[str], sums: bytes
 ) -> None:
     folder = store.fetch_folder("models", "key", lambda folder: (folder / "a.txt").touch())
+    (cache_folder / "outside").touch()  # the last checksum is that of this file
     (folder / store.SUMS).write_bytes(sums)
     assert bench(capfd, "cache", "verify")[0] == 1
     assert store.fetch_folder("models", "key", lambda folder: (folder / "a.txt").touch()) == folder
