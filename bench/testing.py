@@ -58,28 +58,28 @@ def check_defense(defense: Defense, public: Public, secret: Features) -> None:
     """
     before = copy.deepcopy(secret)
     release = defense.protect(secret, public, np.random.default_rng(1))
-    assert type(release) is defense.releases, f"released {type(release).__name__}, declares {defense.releases.__name__}"
-    assert are_equal(secret, before), "changed the secret"
-    assert not _shared(release, secret), "the release shares memory with the secret"
-    assert np.array_equal(release.keypoints, secret.keypoints), "the released keypoints differ from the secret ones"
-    assert release.size == secret.size
+    _require(type(release) is defense.releases, f"released {type(release).__name__}, declares {defense.releases.__name__}")
+    _require(are_equal(secret, before), "changed the secret")
+    _require(not _shared(release, secret), "the release shares memory with the secret")
+    _require(np.array_equal(release.keypoints, secret.keypoints), "the released keypoints differ from the secret ones")
+    _require(release.size == secret.size, "the released size of the photograph differs from that of the secret")
     _check_release(release, len(secret))
-    assert are_equal(release, defense.protect(secret, public, np.random.default_rng(1))), "the same rng gave another release"
+    _require(are_equal(release, defense.protect(secret, public, np.random.default_rng(1))), "the same rng gave another release")
     if not isinstance(release, Descriptors):
         other = defense.protect(secret, public, np.random.default_rng(2))
-        assert not are_equal(release, other), "another rng gave the same release"
+        _require(not are_equal(release, other), "another rng gave the same release")
     privacy = defense.privacy(public)
-    assert privacy.guarantee
-    assert privacy.epsilon is None or privacy.epsilon >= 0
-    assert privacy.log10_true is None or privacy.log10_true <= 0
+    _require(privacy.guarantee, "the guarantee has no name")
+    _require(privacy.epsilon is None or privacy.epsilon >= 0, "epsilon is negative")
+    _require(privacy.log10_true is None or privacy.log10_true <= 0, "the probability of the true word is above 1")
 
 
 def check_applicability(attack: Attack, defense: Defense, extractor: Extractor, public: Public) -> bool:
     """Return whether an attack applies, and check that the answer is the same at each call and a refusal has a reason."""
     task = Reconstruction()
     reason = task.explain_not_applicable(defense, attack, extractor, public)
-    assert reason is None or reason.strip(), "an attack that does not apply must return a reason"
-    assert reason == task.explain_not_applicable(defense, attack, extractor, public)
+    _require(reason is None or reason.strip(), "an attack that does not apply must return a reason")
+    _require(reason == task.explain_not_applicable(defense, attack, extractor, public), "the second call gave another reason")
     return reason is None
 
 
@@ -133,14 +133,14 @@ def _check_attack(
     )
     estimate = _estimate(trial)
     if isinstance(attack, DescriptorAttack):
-        assert estimate.shape == secret.descriptors.shape
+        _require(estimate.shape == secret.descriptors.shape, "the result has another shape than the descriptors of the secret")
     elif isinstance(attack, ImageAttack):
-        assert estimate.shape == (*secret.size[::-1], 3)
-        assert estimate.min() >= 0
-        assert estimate.max() <= 1
+        _require(estimate.shape == (*secret.size[::-1], 3), "the result has another size than the photograph")
+        _require(estimate.min() >= 0, "the result has values below 0")
+        _require(estimate.max() <= 1, "the result has values above 1")
     if not isinstance(attack, ImageAttack):
         np.testing.assert_allclose(np.linalg.norm(estimate, axis=1), 1, atol=TOLERANCE)
-    assert estimate.dtype == np.float32
+    _require(estimate.dtype == np.float32, "the result is not float32")
     if TrueWords in attack.needs:
         return  # an oracle reads a part of the secret, by declaration
     for array in (*_arrays(mine), *quantised):
@@ -149,7 +149,7 @@ def _check_attack(
         if entry.kind not in (maps.KIND, dictionary.KIND):  # these two hold public data alone
             overwrite_with_zeros(entry.path, entry.kind)
     public.clear()
-    assert np.array_equal(estimate, _estimate(trial)), "the attack saw more than the release"
+    _require(np.array_equal(estimate, _estimate(trial)), "the attack saw more than the release")
 
 
 def check_metric(metric: Metric, seed: int = 0) -> None:
@@ -168,31 +168,37 @@ def check_metric(metric: Metric, seed: int = 0) -> None:
             truth = np.concatenate([thumbnails.compute_thumbnail(truth)[None], others])
     before = truth.copy(), estimate.copy()
     perfect, value = metric(truth, best_estimate), metric(truth, estimate)
-    assert np.array_equal(truth, before[0])
-    assert np.array_equal(estimate, before[1])
+    _require(np.array_equal(truth, before[0]), "changed the truth")
+    _require(np.array_equal(estimate, before[1]), "changed the estimate")
     low, high = metric.range
-    assert isinstance(value, float)
-    assert low <= value <= high
-    assert perfect is None or low <= perfect <= high
+    if not isinstance(value, float):
+        raise AssertionError("the value is not a float")
+    _require(low <= value <= high, "the value is outside the declared range")
+    _require(perfect is None or low <= perfect <= high, "the value of the truth is outside the declared range")
     best = (high if metric.higher_is_better_for == "attacker" else low) if perfect is None else perfect
-    assert best > value if metric.higher_is_better_for == "attacker" else best < value, "the truth must be the best estimate"
+    _require(best > value if metric.higher_is_better_for == "attacker" else best < value, "the truth must be the best estimate")
 
 
 def check_extractor(extractor: Extractor, image: np.ndarray, source: Source | None = None) -> None:
     """Check an extractor: unit descriptors at keypoints within the image, ordered by position, the same at each call."""
     before = image.copy()
     features = extractor.extract(image, source)
-    assert np.array_equal(image, before)
-    assert are_equal(features, extractor.extract(image, source))
+    _require(np.array_equal(image, before), "changed the image")
+    _require(are_equal(features, extractor.extract(image, source)), "the second call gave other features")
     height, width = image.shape[:2]
-    assert features.size == (width, height)
-    assert len(features) > 0
-    assert features.keypoints.shape == (len(features), 2)
-    assert (features.keypoints >= 0).all()
-    assert (features.keypoints <= features.size).all()
+    _require(features.size == (width, height), "the features have another size than the image")
+    _require(len(features) > 0, "there is no keypoint")
+    _require(features.keypoints.shape == (len(features), 2), "keypoints must be (N, 2)")
+    _require((features.keypoints >= 0).all(), "a keypoint has a negative coordinate")
+    _require((features.keypoints <= features.size).all(), "a keypoint is outside the image")
     np.testing.assert_allclose(np.linalg.norm(features.descriptors, axis=1), 1, atol=TOLERANCE)
-    assert features.codes is None or arrays_equal(unit_rows(features.codes), features.descriptors)
-    assert are_equal(features, features.by_position()), "the order of keypoints would reveal their strength: return by_position()"
+    _require(
+        features.codes is None or arrays_equal(unit_rows(features.codes), features.descriptors),
+        "the codes are not those of the descriptors",
+    )
+    _require(
+        are_equal(features, features.by_position()), "the order of keypoints would reveal their strength: return by_position()"
+    )
 
 
 def overwrite_with_zeros(file: Path, kind: str) -> None:
@@ -203,7 +209,7 @@ def overwrite_with_zeros(file: Path, kind: str) -> None:
 
 def check_task(task: Task, defense: Defense, extractor: Extractor, secret: Features) -> None:
     """Check a task that takes no attack: its metrics are finite and the same at each call, and it changes no argument."""
-    assert not task.judges_attacks, "check_task is for tasks that take no attack"
+    _require(not task.judges_attacks, "check_task is for tasks that take no attack")
     public, before = Public(), copy.deepcopy(secret)
     release = defense.protect(secret, public, np.random.default_rng(1))
     released = copy.deepcopy(release)
@@ -227,11 +233,14 @@ def check_task(task: Task, defense: Defense, extractor: Extractor, secret: Featu
         return task.evaluate(trial)
 
     first = judged()
-    assert first.metrics, "the outcome has no metric"
-    assert all(value is None or (isinstance(value, float) and np.isfinite(value)) for value in first.metrics.values())
-    assert first.metrics == judged().metrics, "the same rng gave another outcome"
-    assert are_equal(secret, before), "changed the secret"
-    assert are_equal(release, released), "changed the release"
+    _require(first.metrics, "the outcome has no metric")
+    _require(
+        all(value is None or (isinstance(value, float) and np.isfinite(value)) for value in first.metrics.values()),
+        "a metric is neither None nor a finite float",
+    )
+    _require(first.metrics == judged().metrics, "the same rng gave another outcome")
+    _require(are_equal(secret, before), "changed the secret")
+    _require(are_equal(release, released), "changed the release")
 
 
 def check_dataset(dataset: Dataset) -> None:
@@ -241,18 +250,29 @@ def check_dataset(dataset: Dataset) -> None:
     """
     scene, again = dataset.scene(), dataset.scene()
     images = (*scene.references, *scene.queries)
-    assert images, "the scene is empty"
-    assert len({image.name for image in images}) == len(images), "two images have the same name"
+    _require(images, "the scene is empty")
+    _require(len({image.name for image in images}) == len(images), "two images have the same name")
     for image, other in zip(images, (*again.references, *again.queries), strict=True):
         pixels = image.pixels.read()
-        assert pixels.dtype == np.uint8
-        assert pixels.shape == (image.camera.height, image.camera.width, 3), f"{image.name}: its size is not that of its camera"
-        assert image.pixels.content_hash() == other.pixels.content_hash(), f"{image.name}: the second call gave another image"
-        assert np.array_equal(pixels, other.pixels.read()), f"{image.name}: the second call gave another image"
-        assert image.cam_from_world is None or np.isfinite(image.cam_from_world.matrix()).all()
+        _require(pixels.dtype == np.uint8, f"{image.name}: its pixels are not uint8")
+        _require(
+            pixels.shape == (image.camera.height, image.camera.width, 3), f"{image.name}: its size is not that of its camera"
+        )
+        _require(image.pixels.content_hash() == other.pixels.content_hash(), f"{image.name}: the second call gave another image")
+        _require(np.array_equal(pixels, other.pixels.read()), f"{image.name}: the second call gave another image")
+        _require(
+            image.cam_from_world is None or np.isfinite(image.cam_from_world.matrix()).all(),
+            f"{image.name}: its pose is not finite",
+        )
         mask = image.pixels.foreground()
-        assert mask is None or mask.shape == pixels.shape[:2]
-    assert len({image.pixels.content_hash() for image in images}) == len(images), "two images have the same content hash"
+        _require(mask is None or mask.shape == pixels.shape[:2], f"{image.name}: its foreground mask has another size")
+    _require(len({image.pixels.content_hash() for image in images}) == len(images), "two images have the same content hash")
+
+
+def _require(holds: object, message: str) -> None:
+    """Raise AssertionError with the message unless the condition holds. An `assert` would do nothing under `python -O`."""
+    if not holds:
+        raise AssertionError(message)
 
 
 def are_equal(one: Any, other: Any) -> bool:
@@ -276,8 +296,9 @@ def _estimate(trial: Trial) -> Floats:
         return trial.attack.recover(view, rng)
     if isinstance(trial.attack, SelectiveAttack):
         return trial.attack.select(view, rng).descriptors
-    assert isinstance(trial.attack, ImageAttack)
-    return trial.attack.reconstruct(view, rng)
+    if isinstance(trial.attack, ImageAttack):
+        return trial.attack.reconstruct(view, rng)
+    raise AssertionError("the attack recovers neither descriptors nor images")
 
 
 def _arrays(value: Any) -> list[np.ndarray]:
@@ -293,9 +314,9 @@ def _shared(release: Release, secret: Features) -> bool:
 
 def _check_release(release: Release, count: int) -> None:
     for array in _arrays(release):
-        assert len(array) == count
-        assert np.isfinite(array).all()
-        assert array.dtype in (np.float32, np.int64)
+        _require(len(array) == count, "an array has another length than the number of keypoints")
+        _require(np.isfinite(array).all(), "an array has values that are not finite")
+        _require(array.dtype in (np.float32, np.int64), "an array is neither float32 nor int64")
     if isinstance(release, Descriptors):
         np.testing.assert_allclose(np.linalg.norm(release.descriptors, axis=1), 1, atol=TOLERANCE)
     if isinstance(release, Subspaces):
@@ -303,4 +324,4 @@ def _check_release(release: Release, count: int) -> None:
         np.testing.assert_allclose(gram, np.broadcast_to(np.eye(release.dim), gram.shape), atol=TOLERANCE)
     if isinstance(release, WordSets):
         np.testing.assert_allclose(np.linalg.norm(release.candidates, axis=2), 1, atol=TOLERANCE)
-        assert release.words is None or (np.diff(release.words, axis=1) > 0).all(), "words must ascend, each once"
+        _require(release.words is None or (np.diff(release.words, axis=1) > 0).all(), "words must ascend, each once")

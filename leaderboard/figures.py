@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -59,7 +60,7 @@ def build_panels(original: Bytes, records: Sequence[Record], images: Sequence[Pa
     names = build_labels([(record["defense"], record["attack"]) for record in records])
     panels = [Panel(original, "original", "")]
     for record, (defense, attack), image in zip(records, names, images, strict=True):
-        pixels = np.asarray(Image.open(image)) if image.is_file() else None
+        pixels = np.asarray(Image.open(image)) if os.path.isfile(image) else None
         panels.append(Panel(pixels, f"{defense}\n{attack}", _caption(record)))
     return panels
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pycolmap
 
+from bench.core import paths
 from bench.core.errors import UserError
 from bench.datasets import aachen
 from bench.formats import lists, pairs
@@ -43,7 +44,7 @@ def write(records: Iterable[Record], out: Path) -> Iterator[str]:
     if retrieved and len({str(each) for each in retrieved.values()}) == 1:
         retrieved = {"": next(iter(retrieved.values()))}
     for method, by_query in retrieved.items():
-        path = out / (f"pairs-{method}.txt" if method else "pairs.txt")
+        path = paths.assign_path(out, f"pairs-{method}" if method else "pairs", ".txt")
         try:
             pairs.write(path, by_query)
         except UserError as error:  # a name with a space, which hloc's format does not allow

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import numpy as np
 from PIL import Image
 
 from bench.core.table import to_csv, to_markdown
-from bench.runner.directory import photograph_path, reconstruction_path
+from bench.runner.directory import figure_path, photograph_path, reconstruction_path
 from bench.runner.records import Record
 from leaderboard import figures, tables
 from leaderboard.provenance import CHUNK, format_provenance
@@ -32,14 +33,14 @@ def write(records: Sequence[Record], out: Path, command: str) -> None:
     provenance = format_provenance(command, records)
     for sample in dict.fromkeys(record["sample"] for record in records):
         sample_records = [record for record in records if record["sample"] == sample]
-        if any(reconstruction_path(out, record).is_file() for record in sample_records):
+        if any(os.path.isfile(reconstruction_path(out, record)) for record in sample_records):
             _write_figure(sample, sample_records, out, provenance)
 
 
 def _write_figure(sample: str, records: Sequence[Record], out: Path, provenance: str) -> None:
-    photograph, figure = photograph_path(out, records[0]), out / "figures" / f"{sample}.png"
-    if not photograph.is_file():
-        return  # it was removed since
+    photograph, figure = photograph_path(out, records[0]), figure_path(out, sample)
+    if not os.path.isfile(photograph):
+        return  # it was removed since, or the system refused its path
     figure.parent.mkdir(parents=True, exist_ok=True)
     original = np.asarray(Image.open(photograph))
     panels = figures.build_panels(original, records, [reconstruction_path(out, record) for record in records])

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,17 +18,19 @@ import numpy as np
 from bench.api import Plugin
 from bench.codebook.clustered import name_digest
 from bench.codebook.public import ASSETS, CLUSTERED, REFERENCES, SHIPPED
+from bench.core import strict_json
 from bench.core.errors import SampleError, UserError
 from bench.core.progress import Progress
 from bench.images.photographs import list_photographs
 from bench.images.samples import Images
 from bench.registry import discovery, fields, spec
 from bench.registry.discovery import Kind
-from bench.runner import records
+from bench.runner import consistency, records
 from bench.runner.attack_process import execute_in_attack_process
+from bench.runner.consistency import shorten
 from bench.runner.plan import Experiment, Plan, RunConfiguration, build_plan
 from bench.runner.records import EVERY_SAMPLE, Record
-from bench.runner.trial import TrialRunner, build_privacy
+from bench.runner.trial import TrialRunner
 from bench.settings import Asset
 from bench.task_api import Task
 from leaderboard.regression import ABSOLUTE_TOLERANCE, RELATIVE_TOLERANCE
@@ -38,8 +39,6 @@ P = TypeVar("P", bound=Plugin)
 
 SCHEMAS = {1: ASSETS / "record.schema.json", records.SCHEMA: ASSETS / "record-2.schema.json"}
 BUILTIN = "builtin"  # the photographs of every installation
-MAX_LENGTH = 160  # characters of a value in a message
-ROUNDING = 1e-9  # tolerated relative difference of numbers that follow from the configuration alone
 
 
 @dataclass(frozen=True, order=True)
@@ -107,33 +106,20 @@ def _parse_lines(texts: Sequence[bytes]) -> Iterator[NumberedRecord | Fault]:
     }
     for number, text in enumerate(texts, start=1):
         try:
-            record = json.loads(text, parse_constant=_refuse)
+            record = strict_json.parse(text)
         except ValueError as error:
-            yield Fault(number, f"not valid JSON: {error}")
+            yield Fault(number, shorten(error))
             continue
         version = record.get("schema") if isinstance(record, dict) else None
         validator = validators[version if version == 1 else records.SCHEMA]
         errors = sorted(validator.iter_errors(record), key=lambda error: error.json_path)
         for violation in errors:
             part = violation.json_path.removeprefix("$").lstrip(".") or "the record"
-            yield Fault(number, f"{part}: {_shorten(violation.message)}")
-        if not errors and (unbounded := _find_non_finite(record)):
-            yield Fault(number, f"{unbounded}: not finite")
-        elif not errors:
+            yield Fault(number, f"{part}: {shorten(violation.message)}")
+        if not errors:
             if (fault := records.explain_invalid(record)) is not None:
                 yield Fault(number, fault)
             yield NumberedRecord(number, records.upgrade(record))
-
-
-def _refuse(constant: str) -> None:
-    raise ValueError(f"{constant} is not a number of JSON")
-
-
-def _find_non_finite(value: Any, path: str = "") -> str | None:
-    """Return the path of a number that JSON can express and a double cannot, such as 1e999; None if there is none."""
-    if isinstance(value, dict):
-        return next((part for name, inner in value.items() if (part := _find_non_finite(inner, f"{path}.{name}"))), None)
-    return path.lstrip(".") if isinstance(value, float) and not math.isfinite(value) else None
 
 
 def _check_consistency(record: Record) -> Iterator[str]:
@@ -144,13 +130,7 @@ def _check_consistency(record: Record) -> Iterator[str]:
         yield f"experiment_id: is {record['experiment_id']}, but that of this configuration is {expected}"
     if (expected := records.run_hash(record["experiment_id"], record["environment"])) != record["run_hash"]:
         yield f"run_hash: is {record['run_hash']}, but that of this experiment and environment is {expected}"
-    known = {metric.name(): metric for metric in discovery.load_plugins(discovery.METRIC)}
-    for name, value in record["metrics"].items():
-        if name in known and value is not None and not known[name].range[0] <= value <= known[name].range[1]:
-            low, high = known[name].range
-            yield f"metrics.{name}: {value:g} is outside the range from {low:g} to {high:g}"
-    if record["status"] == "ok" and record["privacy"]["keypoints"] != record["metrics"]["keypoints"]:
-        yield "privacy.keypoints: differs from metrics.keypoints"
+    yield from consistency.list_impossible_values(record)
 
 
 def _find_duplicates(lines: Sequence[NumberedRecord]) -> Iterator[Fault]:
@@ -267,11 +247,8 @@ def _check_experiment(experiment: Experiment, members: Sequence[NumberedRecord],
             yield Fault(line.number, f"status: the pair {message}")
         if record["sample"] not in (names if experiment.reason is None else {EVERY_SAMPLE}):
             yield Fault(line.number, f"sample: the dataset has no {record['sample']!r}")
-        expected = build_privacy(experiment, record["privacy"]["keypoints"])
-        for name, value in expected.items():
-            actual = record["privacy"].get(name)
-            if not _is_close(actual, value):
-                yield Fault(line.number, f"privacy.{name}: is {_shorten(actual)}, should be {_shorten(value)}")
+        for message in consistency.list_other_guarantees(record, experiment):
+            yield Fault(line.number, message)
     missing = sorted(names - {line.record["sample"] for line in members}) if experiment.reason is None else []
     if missing:
         yield Fault(first.number, f"its experiment lacks {len(missing)} of {len(names)} samples, such as {missing[0]!r}")
@@ -283,7 +260,7 @@ def _find_difference(record: Record, local: Record) -> str:
         theirs, ours = record[part] or {}, local[part] or {}
         for name in (*theirs, *ours):
             if theirs.get(name) != ours.get(name) and (part != "dataset" or name not in ("name", "spec")):
-                values = f"{_shorten(theirs.get(name))}, here {_shorten(ours.get(name))}"
+                values = f"{shorten(theirs.get(name))}, here {shorten(ours.get(name))}"
                 return f"{part}.{name} is {values} (pass the file by --file if it is not the shipped one)"
     return "its configuration is the same"
 
@@ -311,7 +288,7 @@ def _compare(line: NumberedRecord, repeated: Record | None) -> Iterator[Fault]:
     if repeated is None:
         return  # reported already
     if repeated["status"] != "ok":
-        yield Fault(line.number, f"computed again, it failed: {_shorten(repeated['reason'])}")
+        yield Fault(line.number, f"computed again, it failed: {shorten(repeated['reason'])}")
         return
     submitted, metrics = line.record["metrics"], repeated["metrics"]
     for name in sorted({*submitted, *metrics}):
@@ -325,20 +302,8 @@ def _compare(line: NumberedRecord, repeated: Record | None) -> Iterator[Fault]:
             yield Fault(line.number, f"metrics.{name}: {values}")
 
 
-def _is_close(one: Any, other: Any) -> bool:
-    numbers = all(isinstance(value, (int, float)) and not isinstance(value, bool) for value in (one, other))
-    return math.isclose(one, other, rel_tol=ROUNDING) if numbers else bool(one == other)
-
-
 def _format_number(value: float | None) -> str:
     return "missing" if value is None else f"{value:.6g}"
-
-
-def _shorten(value: Any) -> str:
-    """Return the value as one short line of printable characters."""
-    text = " ".join(str(value).split())
-    text = "".join(letter if letter.isprintable() else "?" for letter in text)
-    return text if len(text) <= MAX_LENGTH else text[: MAX_LENGTH - 3] + "..."
 
 
 def _read_digest(path: Path) -> str:

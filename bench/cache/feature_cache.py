@@ -19,6 +19,7 @@ from bench.cache import provenance, store
 from bench.codebook import dictionary
 from bench.codebook.dictionary import Dictionary
 from bench.core import environment, threads
+from bench.core.child_process import end_with_parent
 from bench.core.progress import Progress
 from bench.formats.tensor_file import Arrays
 from bench.images.scene import Pixels
@@ -60,11 +61,16 @@ def extract_all(extractor: Extractor, images: Sequence[Pixels]) -> Iterator[Feat
     missing = [image for image in images if not store.entry_path(KIND, _key(extractor, image)).is_file()]
     processes = torch.get_num_threads()
     if len(missing) > MAX_SEQUENTIAL and processes > 1:
-        executor = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), threads.limit_threads, (1,))
+        executor = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), _start_worker)
         with executor, Progress("features of reference images", len(missing)) as progress:
             for _ in executor.map(_extract_to_cache, itertools.repeat(extractor), missing):
                 progress.advance()
     return (extract(extractor, image) for image in images)
+
+
+def _start_worker() -> None:
+    end_with_parent()
+    threads.limit_threads(1)
 
 
 def _extract_to_cache(extractor: Extractor, pixels: Pixels) -> None:

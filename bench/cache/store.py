@@ -19,6 +19,7 @@ from typing import Any
 
 from platformdirs import user_cache_path
 
+from bench.core import paths
 from bench.core.environment import DISTRIBUTION
 from bench.core.errors import UserError
 from bench.core.hashing import canonical_json
@@ -161,18 +162,30 @@ def list_entries() -> Iterator[Entry]:
 def _find_fault(path: Path) -> str | None:
     if path.name.endswith(".unfinished"):
         return f"{path}: incomplete, its writer ended early"
-    if path.is_dir():
-        sums = path / SUMS
-        listed = [line.split("  ", 1) for line in sums.read_text().splitlines()] if sums.is_file() else []
-        wrong = [name for digest, name in listed if not (path / name).is_file() or _sha256(path / name) != digest]
-        if wrong or not listed:
-            return f"{path}: {'the checksum of ' + wrong[0] + ' is wrong' if wrong else 'has no checksums'}"
-        return None
     try:
-        tensor_file.verify(path)
+        if path.is_dir():
+            _verify_folder(path)
+        else:
+            tensor_file.verify(path)
     except UserError as error:
         return str(error)
+    except OSError as error:
+        return f"{path}: cannot be read: {error.strerror}"
     return None
+
+
+def _verify_folder(folder: Path) -> None:
+    """Raise UserError if a file of a folder differs from its checksum, or there are no checksums."""
+    sums = folder / SUMS
+    if not sums.is_file():
+        raise UserError(f"{folder}: has no checksums")
+    listed = [line.partition("  ") for line in sums.read_text(encoding="utf-8", errors="replace").splitlines()]
+    if not listed:
+        raise UserError(f"{folder}: has no checksums")
+    for digest, _, name in listed:
+        file = paths.find_file(folder, name)
+        if not file.is_file() or _sha256(file) != digest:
+            raise UserError(f"{folder}: the checksum of {name} is wrong")
 
 
 def _copy(source: Path, target: Path) -> None:

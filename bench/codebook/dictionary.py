@@ -82,7 +82,7 @@ def load(path: Path) -> Dictionary:
     Raises
     ------
     UserError
-        if the file is damaged, or its words are not (K, 128) uint8.
+        if the file is damaged, its words are not (K, 128) uint8 or one is zero, or its metadata name no photographs.
     """
     arrays, meta, digest = tensor_file.load(path, KIND)
     words = arrays.get("words", np.empty(0))
@@ -90,4 +90,9 @@ def load(path: Path) -> Dictionary:
         raise UserError(f"{path}: words are {words.dtype}, expected uint8")
     if words.ndim != 2 or words.shape[1] != 128 or len(words) < 2:
         raise UserError(f"{path}: words have shape {words.shape}, expected (K, 128) with K at least 2")
+    if not words.any(axis=1).all():
+        raise UserError(f"{path}: word {int(np.argmin(words.any(axis=1)))} is zero, which has no direction")
+    photographs = meta.get("photographs")
+    if not isinstance(photographs, list) or not all(isinstance(content, str) for content in photographs):
+        raise UserError(f"{path}: its metadata lack the photographs; build it with `bench dictionary build`")
     return Dictionary(words, meta, digest)

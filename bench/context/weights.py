@@ -12,7 +12,7 @@ import numpy as np
 
 from bench.core.errors import UserError
 from bench.formats import tensor_file
-from bench.formats.network_file import NetworkFile
+from bench.formats.network_file import NetworkFile, build_module
 
 if TYPE_CHECKING:
     from bench.context.network import ContextModel
@@ -38,7 +38,7 @@ class Network(NetworkFile):
         from bench.context.network import ContextModel, Shape
         from bench.core.device import pick_device
 
-        module = ContextModel(Shape(**self.meta["shape"]))
+        module = build_module(self.path, lambda: ContextModel(Shape(**self.meta["shape"])))
         try:
             module.load_state_dict({name: torch.from_numpy(array.astype(np.float32)) for name, array in self.arrays.items()})
         except RuntimeError as error:

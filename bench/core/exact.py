@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from decimal import Decimal
+from decimal import Decimal, DecimalException
 from fractions import Fraction
 
 INFINITE = ("inf", "infinity")
+# Decimal exponents of the least and the greatest double. They are tested first: a fraction beyond them may not fit into memory.
+LEAST, GREATEST = -324, 308
 
 
 class Exact(float):
@@ -14,7 +16,7 @@ class Exact(float):
     Raises
     ------
     ValueError
-        if the text is not a number, or too large for a double.
+        if the text is not a number, or too large or too small for a double.
     """
 
     fraction: Fraction | None  # None if infinite
@@ -43,10 +45,24 @@ def to_fraction(value: str | float | Decimal | Fraction) -> Fraction:
     Raises
     ------
     ValueError, OverflowError
-        if `value` is not a finite number.
+        if `value` is not a finite number, or outside the exponents of doubles.
     """
     if isinstance(value, Exact):
         if value.fraction is None:
             raise OverflowError("infinity is not a fraction")
         return value.fraction
+    if isinstance(value, (str, Decimal)) and "/" not in str(value):
+        return _from_decimal(value)
     return Fraction(repr(float(value)) if isinstance(value, float) else value)
+
+
+def _from_decimal(value: str | Decimal) -> Fraction:
+    try:
+        decimal = Decimal(value)
+    except DecimalException as error:  # such as an exponent of 20 digits
+        raise ValueError(f"{value!r} is not a number of this range") from error
+    if decimal.is_finite() and decimal == 0:
+        return Fraction(0)
+    if decimal.is_finite() and not LEAST <= decimal.adjusted() <= GREATEST:
+        raise OverflowError("its exponent is outside the range of a double")
+    return Fraction(value)

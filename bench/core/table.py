@@ -80,9 +80,10 @@ def to_terminal(table: Table) -> RichTable:
 def to_markdown(table: Table, *, plain: bool = False) -> str:
     """Return the table as Markdown, with its heading, its numbered notes and its remarks.
 
-    `plain` is for texts of this program: only bars and line breaks are escaped, no column is aligned, and notes are omitted.
+    Names of metrics, samples and files come from plugins and users, so all texts are escaped. `plain` is for reading the source:
+    underscores within words are not escaped, no column is aligned, and notes are omitted.
     """
-    escape = str if plain else escape_markdown
+    escape = _escape_boundaries if plain else escape_markdown
     numbers = _number_notes(table)
     lines = [f"**{escape(table.heading)}**", ""] if table.heading else []
     lines.append(markdown_row(escape(column.label) for column in table.columns))
@@ -156,6 +157,11 @@ def markdown_row(cells: Iterable[Any]) -> str:
 def escape_markdown(text: str) -> str:
     """Return text that Markdown shows unchanged; `markdown_row` escapes the bars of tables."""
     return re.sub(r"([\\`*_\[\]<>#~$])", r"\\\1", _join_lines(text))
+
+
+def _escape_boundaries(text: str) -> str:
+    """Escape Markdown, except for underscores within words: they start no emphasis."""
+    return re.sub(r"(?<=[^\W_])\\_(?=[^\W_])", "_", escape_markdown(text))
 
 
 def escape_latex(text: str) -> str:

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, get_args
 
 from bench.api import Dataset
+from bench.core import paths
 from bench.core.errors import UserError
 from bench.datasets import colmap
 from bench.formats import colmap_model, lists, nvm
@@ -101,7 +102,7 @@ def write_evaluation(folder: Path, method: str, poses: Mapping[str, pycolmap.Rig
         if base in by_base:
             raise UserError(f"{name}: another query has the same basename {base}, by which the server identifies queries")
         by_base[base] = pose
-    path = folder / f"Aachen_eval_{method}.txt"
+    path = paths.assign_path(folder, f"Aachen_eval_{method}", ".txt")
     localized = {base: pose for base, pose in by_base.items() if pose is not None}
     lists.write_poses(path, localized)
     return path, len(poses) - len(localized)

@@ -11,12 +11,14 @@ The folder contains
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, get_args
 
 from bench.api import Dataset
+from bench.core import paths
 from bench.core.errors import UserError
 from bench.formats import colmap_model, lists
 from bench.formats.colmap_model import PosedImage
@@ -114,11 +116,14 @@ def _read_poses(path: Path) -> dict[str, tuple[str, pycolmap.Rigid3d]]:
 
 
 def _find_image(name: str, where: str, camera: pycolmap.Camera, images: Path, masks: Path | None) -> File:
-    path = images / name
-    if not path.is_file():
+    try:
+        path = paths.find_file(images, name)
+        mask = None if masks is None else paths.find_file(masks, name).with_suffix(".png")
+    except UserError as error:
+        raise UserError(f"{where}: {error}") from None
+    if not os.path.isfile(path):
         raise UserError(f"{where}: there is no image {path}")
-    mask = None if masks is None else (masks / name).with_suffix(".png")
-    mask = mask if mask is not None and mask.is_file() else None
+    mask = mask if mask is not None and os.path.isfile(mask) else None
     return File(path=path, size=(camera.width, camera.height), mask=mask, name=name)
 
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, get_args
 import numpy as np
 from PIL import Image
 
+from bench.core import paths
 from bench.core.errors import UserError
 from bench.core.progress import Progress
 from bench.formats import lists, nvm
@@ -27,24 +28,26 @@ def write(scene: Scene, layout: str, out: Path) -> None:
     Raises
     ------
     UserError
-        if the folder is not empty, the layout is unknown, or the layout cannot represent the scene.
+        if the folder is not empty, a name leads out of it, the layout is unknown, or the layout cannot represent the scene.
     """
     if layout not in LAYOUTS:
         raise UserError(f"--layout {layout}: unknown layout; available: {', '.join(LAYOUTS)}")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise UserError(f"--out {out}: exists already; give a new folder")
-    lists.check_names(image.name for image in scene.references + scene.queries)
+    images_to_write = scene.references + scene.queries
+    lists.check_names(image.name for image in images_to_write)
+    for image in images_to_write:
+        paths.find_file(out, image.name)  # refuses a name that leads out of the folder, before anything is written
     images = LAYOUTS[layout](scene, out)
     poses = {query.name: query.cam_from_world for query in scene.queries if query.cam_from_world is not None}
     if poses:
         lists.write_poses(out / "ground_truth.txt", poses)
-    images_to_write = scene.references + scene.queries
     with Progress(f"writing {layout}", len(images_to_write)) as progress:
         for image in images_to_write:
-            _save_png(images / image.name, image.pixels.read())
+            _save_png(paths.find_file(images, image.name), image.pixels.read())
             mask = image.pixels.foreground()
             if mask is not None:
-                _save_png(out / "foreground" / image.name, mask.astype(np.uint8) * 255)
+                _save_png(paths.find_file(out / "foreground", image.name), mask.astype(np.uint8) * 255)
             progress.advance(note=image.name)
 
 

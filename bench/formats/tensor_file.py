@@ -10,9 +10,25 @@ from typing import Any
 
 import numpy as np
 
+from bench.core import strict_json
 from bench.core.errors import UserError
 
 Arrays = dict[str, np.ndarray]
+DTYPES = {
+    "BOOL",
+    "U8",
+    "I8",
+    "U16",
+    "I16",
+    "U32",
+    "I32",
+    "U64",
+    "I64",
+    "F16",
+    "F32",
+    "F64",
+    "C64",
+}  # types of safetensors in NumPy
 
 
 def hash_content(kind: str, arrays: Arrays, meta: dict[str, Any]) -> str:
@@ -56,7 +72,7 @@ def load(path: Path, kind: str) -> tuple[Arrays, dict[str, Any], str]:
     Raises
     ------
     UserError
-        if there is no such file, its kind differs, or its digest is wrong.
+        if there is no such file, it is no safetensors file of this program, its kind differs, or its digest is wrong.
     """
     arrays, header = _read(path)
     if header.get("kind") != kind:
@@ -70,11 +86,9 @@ def verify(path: Path) -> None:
     Raises
     ------
     UserError
-        if there is no such file, or its digest is wrong.
+        if there is no such file, it is no safetensors file of this program, or its digest is wrong.
     """
     arrays, header = _read(path)
-    if not {"kind", "digest", "meta"} <= header.keys():
-        raise UserError(f"{path}: has no checksum")
     _check_digest(path, arrays, header)
 
 
@@ -85,15 +99,25 @@ def _read(path: Path) -> tuple[Arrays, dict[str, str]]:
         raise UserError(f"{path}: no such file")
     try:
         with safe_open(path, framework="numpy") as opened:
-            header = opened.metadata() or {}
-            return {name: opened.get_tensor(name) for name in opened.keys()}, header  # noqa: SIM118 (it is no mapping)
-    except (SafetensorError, OSError) as error:
+            names, header = list(opened.keys()), opened.metadata() or {}
+            for name in names:
+                if (dtype := opened.get_slice(name).get_dtype()) not in DTYPES:
+                    raise UserError(f"{path}: tensor {name} has the type {dtype}, which NumPy does not know")
+            return {name: opened.get_tensor(name) for name in names}, header
+    except (SafetensorError, OSError, ValueError) as error:
         raise UserError(f"{path}: not a complete safetensors file: {error}") from error
 
 
 def _check_digest(path: Path, arrays: Arrays, header: dict[str, str]) -> tuple[dict[str, Any], str]:
     """Return the metadata and the digest."""
-    meta = json.loads(header["meta"])
+    if not {"kind", "digest", "meta"} <= header.keys():
+        raise UserError(f"{path}: has no checksum, so this program did not write it")
+    try:
+        meta = strict_json.parse(header["meta"])
+    except ValueError as error:
+        raise UserError(f"{path}: its metadata are damaged: {error}") from None
+    if not isinstance(meta, dict):
+        raise UserError(f"{path}: its metadata are not a JSON object, so this program did not write it")
     digest = hash_content(header["kind"], arrays, meta)
     if digest != header.get("digest"):
         raise UserError(f"{path}: its checksum is {digest}, but {header.get('digest')} was written; fetch or build it again")

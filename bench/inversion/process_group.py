@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import nn
 
+from bench.core.child_process import end_with_parent
 from bench.core.device import pick_device
 from bench.core.errors import UserError
 from bench.inversion import norm
@@ -106,6 +107,7 @@ def _run_worker(
     fabric: Fabric, failure: Path, function: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]
 ) -> Any:
     """Run the function in one process. Errors for the user are pickled to a file, since exceptions reach the parent as text."""
+    end_with_parent()
     group = ProcessGroup(fabric.global_rank, fabric.world_size, fabric)
     if not group.is_main:
         sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115  # only the main process reports; open until the process ends

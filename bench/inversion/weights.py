@@ -6,7 +6,7 @@ import functools
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from bench.api import Defense, Extractor
 from bench.codebook.public import Public
 from bench.core.errors import UserError
 from bench.formats import tensor_file
-from bench.formats.network_file import NetworkFile
+from bench.formats.network_file import NetworkFile, build_module
 from bench.registry import fields, spec
 from bench.settings import Between, OneOf
 
@@ -53,7 +53,8 @@ class Network(NetworkFile):
         from bench.core.device import pick_device
         from bench.inversion.network import Inverter, Shape
 
-        module = Inverter(Shape(**{**self.meta["shape"], "widths": tuple(self.meta["shape"]["widths"])}))
+        shape = self.meta["shape"]
+        module = build_module(self.path, lambda: Inverter(Shape(**{**shape, "widths": tuple(shape["widths"])})))
         for name, value in module.state_dict().items():
             if not value.is_floating_point():
                 continue  # batch norm's counter of batches, used in training only
@@ -97,6 +98,8 @@ def _load(path: Path, version: object) -> Network:
     missing = [key for key in REQUIRED_METADATA if key not in meta]
     if missing:
         raise UserError(f"{path}: metadata lack {', '.join(missing)}; train the network anew with `bench train`")
+    if not _are_metadata(meta):
+        raise UserError(f"{path}: its metadata describe no training; train the network anew with `bench train`")
     wrong = sorted({str(array.dtype) for array in arrays.values()} - {"float16", "float32"})
     if wrong:
         raise UserError(f"{path}: weights are {', '.join(wrong)}, expected float16 or float32")
@@ -104,6 +107,28 @@ def _load(path: Path, version: object) -> Network:
         if not np.isfinite(array).all():
             raise UserError(f"{path}: tensor {name} has non-finite numbers; train the network anew")
     return Network(path, arrays, meta, digest)
+
+
+def _are_metadata(meta: dict[str, Any]) -> bool:
+    """Return whether the required metadata have their types."""
+    from bench.inversion.encoding import Encoding  # it imports PyTorch
+
+    plugins = (meta["defense"], meta["extractor"])
+    if not all(isinstance(plugin, dict) and isinstance(plugin.get("name"), str) for plugin in plugins):
+        return False
+    if not isinstance(meta["serves"], dict) or not all(map(_is_setting, meta["serves"].values())):
+        return False
+    return isinstance(meta["shape"], dict) and type(meta["slots"]) is int and meta["encoding"] in get_args(Encoding)
+
+
+def _is_setting(text: Any) -> bool:
+    """Return whether `_decode_setting` reads a value."""
+    if not isinstance(text, dict):
+        return False
+    limits, values = text.get("between"), text.get("one_of")
+    if isinstance(limits, list):
+        return len(limits) == 2 and all(isinstance(limit, int | float) for limit in limits)
+    return isinstance(values, list) and all(isinstance(value, str | int | float | None) for value in values)
 
 
 def initialise_from(fresh: Inverter, trained: Inverter, candidates: int) -> None:

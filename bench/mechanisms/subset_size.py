@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from bench.core.errors import UserError
+from bench.core.exact import Exact
 from bench.core.table import Table, build_table
 from bench.mechanisms.subset import log10_chance, most_accurate_size, most_informative_size, mutual_information
 from bench.types import Indices
@@ -134,16 +135,29 @@ def collect_recalls(
     repeatability = []
     for record in records:
         defense = record["defense"]
-        if not _is_comparable(record, trials, condition) or defense["name"] != "ldp" or defense["words"] != domain:
+        if not _is_comparable(record, trials, condition) or defense["name"] != "ldp" or defense.get("words") != domain:
             continue
-        value = float(defense["epsilon"])
-        if math.isinf(value) and defense["subset_size"] == 1:
-            repeatability.append(record["metrics"]["inliers"] / record["metrics"]["keypoints"])
-        elif abs(value - epsilon) < EPSILON_TOLERANCE:
-            recalls.setdefault(defense["subset_size"], []).append(record["metrics"][RECALL])
+        value, metrics = _read_epsilon(defense.get("epsilon")), record["metrics"]
+        if (
+            math.isinf(value)
+            and defense.get("subset_size") == 1
+            and metrics.get("inliers") is not None
+            and metrics.get("keypoints")
+        ):
+            repeatability.append(metrics["inliers"] / metrics["keypoints"])
+        elif abs(value - epsilon) < EPSILON_TOLERANCE and metrics.get(RECALL) is not None:
+            recalls.setdefault(defense.get("subset_size"), []).append(metrics[RECALL])
     if not recalls and not repeatability:
         raise UserError(f"--results: no localization with ldp:epsilon={epsilon:g} or inf, words={domain} found")
     return recalls, repeatability
+
+
+def _read_epsilon(value: Any) -> float:
+    """Return the ε of a record, which is a number, "inf" or a fraction as text; NaN for anything else."""
+    try:
+        return Exact(value)
+    except (TypeError, ValueError):
+        return math.nan
 
 
 def _is_comparable(record: Mapping[str, Any], trials: int, condition: str) -> bool:

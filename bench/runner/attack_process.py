@@ -24,6 +24,7 @@ from safetensors.numpy import load, save
 from bench import threat_model
 from bench.api import Extractor, Selection, View
 from bench.codebook.public import Public
+from bench.core.child_process import end_with_parent
 from bench.core.errors import SampleError
 from bench.images.scene import Scene
 from bench.localization.scene_index import SceneIndex
@@ -132,6 +133,7 @@ def _execute(theirs: Connection) -> None:
     """Execute the method in the attack process, and send its result."""
     import traceback
 
+    end_with_parent()
     method, view, granted, rng = theirs.recv()
     kinds = [getattr(threat_model, name) for name in granted]
     view = dataclasses.replace(view, knowledge={kind: functools.partial(_unpack, theirs, kind) for kind in kinds})

@@ -7,6 +7,7 @@ running jobs. The lock on the records shows whether their process runs: the oper
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
 import socket
@@ -16,7 +17,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
-from bench.core.errors import UserError
+from bench.core import paths, strict_json
+from bench.core.errors import SampleError, UserError
+from bench.runner.record_shape import is_plugin
 from bench.runner.records import Record, key
 
 if TYPE_CHECKING:
@@ -25,20 +28,29 @@ if TYPE_CHECKING:
     from bench.runner.trial import Result
 
 ERRORS = "errors.log"
+# Errors of one path, and not of the disk: the name is too long for the system, or a file has the name of a folder.
+ERRORS_OF_NAMES = {errno.ENAMETOOLONG, errno.EINVAL, errno.EILSEQ, errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ELOOP}
 PLAN = "plan.json"
 RUNNING = "running.json"
+LATEST = 250_000_000_000  # seconds since the epoch; later times have no date
 METADATA = ("task", "defense", "attack", "dataset", "seed", "experiment_id", "run_hash")  # of an experiment, in the plan's file
 
 
 def reconstruction_path(out: Path, record: Record) -> Path:
     """Return the path of a record's reconstruction. For records of schema 1 the folder is `cell_id`."""
-    return out / "reconstructions" / str(record.get("cell_id", record["experiment_id"])) / f"{record['sample']}.png"
+    experiment = paths.assign_path(out / "reconstructions", str(record.get("cell_id", record["experiment_id"])))
+    return paths.assign_path(experiment, record["sample"], ".png")
 
 
 def photograph_path(out: Path, record: Record) -> Path:
     """Return the path of a record's photograph, as it was attacked. Its folder is a hash: datasets can have equal names."""
     content = record["dataset"]["hash"].removeprefix("sha256:")[:16]
-    return out / "photographs" / content / f"{record['sample']}.png"
+    return paths.assign_path(paths.assign_path(out / "photographs", content), record["sample"], ".png")
+
+
+def figure_path(out: Path, sample: str) -> Path:
+    """Return the path of the figure with all reconstructions of a sample."""
+    return paths.assign_path(out / "figures", sample, ".png")
 
 
 def write_result(result: Result, out: Path) -> None:
@@ -46,19 +58,30 @@ def write_result(result: Result, out: Path) -> None:
 
     Raises
     ------
+    SampleError
+        if the system does not accept the path of one of them.
     OSError
-        if one cannot be written.
+        if one cannot be written, for example to a full disk.
     """
     for content, path in (
         (result.reconstruction, reconstruction_path(out, result.record)),
         (result.photograph, photograph_path(out, result.record)),
     ):
         if content is not None:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(content)
+            _write_picture(path, content)
     if result.trace is not None:
-        with (out / ERRORS).open("a", encoding="utf-8") as log:
+        with (out / ERRORS).open("a", encoding="utf-8", errors="backslashreplace") as log:
             log.write(f"{result.record['sample']}\n{result.trace}\n")
+
+
+def _write_picture(path: Path, content: bytes) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+    except OSError as error:
+        if error.errno not in ERRORS_OF_NAMES:
+            raise
+        raise SampleError(f"its picture cannot be written to {path}: {error.strerror}") from error
 
 
 def write_plan(out: Path, plans: Sequence[Plan]) -> None:
@@ -92,12 +115,12 @@ def read_plan(out: Path) -> list[dict[str, Any]]:
     """
     path = out / PLAN
     try:
-        plans = json.loads(path.read_bytes())
+        plans = strict_json.parse(path.read_bytes())
     except FileNotFoundError:
         raise UserError(f"{path}: no such file; nothing was run there") from None
     except ValueError as error:
-        raise UserError(f"{path}: not valid JSON ({error}); repeat the run to write the file again") from None
-    if not all("experiments" in plan and "samples" in plan for plan in plans):
+        raise UserError(f"{path}: {error}; repeat the run to write the file again") from None
+    if not isinstance(plans, list) or not all(map(_is_plan, plans)):
         raise UserError(f"{path}: written by another version of this program; repeat the run to write the file again")
     return plans
 
@@ -136,9 +159,37 @@ class RunningJobs:
 def read_running(out: Path) -> dict[str, Any] | None:
     """Return the process that writes, or that ended before the run was complete; None if there is none."""
     try:
-        return json.loads((out / RUNNING).read_bytes())
+        running = strict_json.parse((out / RUNNING).read_bytes())
     except (OSError, ValueError):
         return None
+    return running if _is_running(running) else None
+
+
+def _is_plan(plan: Any) -> bool:
+    """Return whether a value is a plan of this version, as `write_plan` writes it."""
+    if not isinstance(plan, dict) or not _is_texts(plan.get("samples")) or not isinstance(plan.get("experiments"), list):
+        return False
+    return all(
+        isinstance(experiment, dict)
+        and {*METADATA, "reason"} <= experiment.keys()
+        and isinstance(experiment["reason"], str | None)
+        and all(isinstance(experiment[name], str) for name in ("task", "run_hash"))
+        and all(is_plugin(experiment[name]) for name in ("defense", "attack") if experiment[name] is not None)
+        for experiment in plan["experiments"]
+    )
+
+
+def _is_running(running: Any) -> bool:
+    """Return whether a value is the content of `running.json`."""
+    if not isinstance(running, dict) or not {"host", "pid", "engine", "since"} <= running.keys():
+        return False
+    jobs, since = running.get("jobs", []), running["since"]
+    known = isinstance(since, int | float) and 0 <= since < LATEST and isinstance(jobs, list)
+    return known and all(_is_texts(job) and len(job) == 2 for job in jobs)
+
+
+def _is_texts(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(text, str) for text in value)
 
 
 def _replace(path: Path, value: Any) -> None:

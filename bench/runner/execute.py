@@ -10,9 +10,11 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 from bench.api import Attack, Dataset, Defense, Extractor, Metric
+from bench.core.errors import SampleError, UserError
 from bench.images.samples import Images
 from bench.registry import discovery, spec
 from bench.runner import directory, records, trial
+from bench.runner.consistency import list_contradictions
 from bench.runner.engines.base import IN_PROCESS, Engine, Job
 from bench.runner.plan import Plan, RunConfiguration, build_plan, cross
 from bench.runner.records import EVERY_SAMPLE, Record
@@ -79,7 +81,8 @@ def execute(plans: Sequence[Plan], out: Path | None = None, engine: Engine = IN_
     Raises
     ------
     UserError
-        before anything is written, if `out` cannot be written, holds a damaged record, or another process writes to it.
+        before anything is written, if `out` cannot be written, holds a damaged record or one that contradicts the plan, or
+        another process writes to it.
     OSError
         if the disk is full; every record yielded so far is stored.
     """
@@ -89,17 +92,46 @@ def execute(plans: Sequence[Plan], out: Path | None = None, engine: Engine = IN_
     with records.Log(out / records.FILE) as log:
         if log.before.notice:
             logging.getLogger(__name__).warning(log.before.notice)
+        resumed = _select_finished(plans, log.before, out / records.FILE)
         directory.write_plan(out, plans)
-        finished = {records.key(record): record for record in log.before.records if record["status"] != "failed"}
-        planned = dict.fromkeys(key for plan in plans for key in plan.list_record_keys())
-        resumed = [finished[key] for key in planned if key in finished]
         yield from resumed
         with directory.RunningJobs(out, engine.name) as running:
             for result in _run_missing(plans, set(map(records.key, resumed)), engine, running.track):
-                directory.write_result(result, out)
-                log.append(result.record)
-                running.remove(result.record)
-                yield result.record
+                record = result.record
+                try:
+                    directory.write_result(result, out)
+                except SampleError as error:
+                    record = trial.fail(record, str(error))
+                log.append(record)
+                running.remove(record)
+                yield record
+
+
+def _select_finished(plans: Sequence[Plan], held: records.Contents, file: Path) -> list[Record]:
+    """Return the finished records of the plans, in their order.
+
+    Raises
+    ------
+    UserError
+        if one of them contradicts the plan or the range of a metric.
+    """
+    finished = {
+        records.key(record): (number, record)
+        for number, record in zip(held.numbers, held.records, strict=True)
+        if record["status"] != "failed"
+    }
+    resumed = {}
+    for plan in plans:
+        experiments = {experiment.metadata["run_hash"]: experiment for experiment in plan.experiments}
+        conditions = {sample.name: sample.condition for sample in plan.samples}
+        for key in plan.list_record_keys():
+            if key not in finished or key in resumed:
+                continue
+            number, record = finished[key]
+            for contradiction in list_contradictions(record, experiments[key[0]], conditions.get(key[1])):
+                raise UserError(f"{file}, line {number}: {contradiction}; remove the line, and its sample is computed again")
+            resumed[key] = record
+    return list(resumed.values())
 
 
 def sort_records(plans: Sequence[Plan], unsorted: Iterable[Record]) -> list[Record]:

@@ -15,8 +15,10 @@ from typing import TYPE_CHECKING, Any
 
 from filelock import FileLock, Timeout
 
+from bench.core import strict_json
 from bench.core.errors import UserError
 from bench.core.hashing import digest, short_hash
+from bench.runner.record_shape import explain_misshapen
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -55,6 +57,7 @@ class Contents:
     """Contents of a file of records."""
 
     records: list[Record]
+    numbers: list[int]  # of their lines, counted from 1
     whole: int  # bytes up to the end of the last whole line
     notice: str | None = None  # a warning about an incomplete last line
 
@@ -71,10 +74,11 @@ def read(path: Path) -> Contents:
         if another line is no record, or was changed after it was written; the message names file and line.
     """
     *lines, rest = path.read_bytes().split(b"\n")
-    contents = [_parse(path, number, line) for number, line in enumerate(lines, start=1) if line.strip()]
+    numbers = [number for number, line in enumerate(lines, start=1) if line.strip()]
+    contents = [_parse(path, number, lines[number - 1]) for number in numbers]
     whole = sum(len(line) + 1 for line in lines)
     notice = f"{path}: the last line was cut off and is skipped" if rest else None
-    return Contents(contents, whole, notice)
+    return Contents(contents, numbers, whole, notice)
 
 
 def keep_latest(records: Iterable[Record]) -> list[Record]:
@@ -192,19 +196,18 @@ class Log:
 
 def explain_invalid(record: Any) -> str | None:
     """Return the reason why a value is no valid record of schema 2 or 1, by its hashes and its digest; None if it is valid."""
-    if not isinstance(record, dict) or record.get("schema") not in (1, SCHEMA):
+    if not isinstance(record, dict) or type(record.get("schema")) is not int or record["schema"] not in (1, SCHEMA):
         return f"not a record of schema {SCHEMA} or 1"
+    if (fault := explain_misshapen(record if record["schema"] == SCHEMA else _rename(record))) is not None:
+        return fault
     if record["schema"] == SCHEMA:
         if record.get("digest") != digest({name: value for name, value in record.items() if name != "digest"}):
             return "its digest does not match: the line was changed after it was written"
         return None
-    if "task_settings" not in record:  # the oldest records of schema 1 do not hold all that they hash
+    if record.get("task_settings") is None:  # the oldest records of schema 1 do not hold all that they hash
         return None
-    try:
-        experiment = short_hash([1, *_configuration(record)])
-        run = run_hash(record["cell_id"], record["environment"])
-    except (KeyError, TypeError, AttributeError) as error:
-        return f"an incomplete record of schema 1 ({type(error).__name__}: {error})"
+    experiment = short_hash([1, *_configuration(record)])
+    run = run_hash(record["cell_id"], record["environment"])
     if experiment != record["cell_id"]:
         return f"cell_id is {record['cell_id']}, but its configuration has {experiment}"
     if run != record["run_hash"]:
@@ -216,12 +219,16 @@ def upgrade(record: Record) -> Record:
     """Return a valid record with the keys and hashes of schema 2. A record of schema 1 retains its `cell_id`."""
     if record["schema"] == SCHEMA:
         return record
-    renamed = {RENAMED_SINCE_1.get(name, name): value for name, value in record.items()}
-    settings: dict[str, Any] = {"task_settings": {}} if "task_settings" not in record else {}
-    renamed |= settings | {"schema": SCHEMA, "cell_id": record["cell_id"]}
+    settings: dict[str, Any] = {"task_settings": {}} if record.get("task_settings") is None else {}
+    renamed = _rename(record) | settings | {"schema": SCHEMA, "cell_id": record["cell_id"]}
     renamed["experiment_id"] = short_hash(_configuration(renamed))
     renamed["run_hash"] = run_hash(renamed["experiment_id"], record["environment"])
     return seal(renamed)
+
+
+def _rename(record: Record) -> Record:
+    """Return a record of schema 1 under the names of schema 2."""
+    return {RENAMED_SINCE_1.get(name, name): value for name, value in record.items()}
 
 
 def _configuration(record: Record) -> list[Any]:
@@ -237,9 +244,9 @@ def _content(dataset: Mapping[str, Any]) -> dict[str, Any]:
 
 def _parse(path: Path, number: int, line: bytes) -> Record:
     try:
-        record = json.loads(line)
-    except (ValueError, RecursionError) as error:
-        raise UserError(f"{path}, line {number}: not valid JSON ({error}); repair or remove the line") from error
+        record = strict_json.parse(line)
+    except ValueError as error:
+        raise UserError(f"{path}, line {number}: {error}; repair or remove the line") from error
     if (fault := explain_invalid(record)) is not None:
         raise UserError(f"{path}, line {number}: {fault}; repair or remove the line")
     return upgrade(record)

@@ -248,6 +248,13 @@ def build_record(
     )
 
 
+def fail(record: Record, reason: str) -> Record:
+    """Return the record of a sample that failed after its evaluation."""
+    entries = {name: value for name, value in record.items() if name != "estimates"}
+    privacy = record["privacy"] | dict.fromkeys(("keypoints", "epsilon_image", "epsilon_image_optimal"))
+    return seal(entries | {"status": "failed", "reason": reason, "metrics": {}, "privacy": privacy, "seconds": None})
+
+
 def build_privacy(experiment: Experiment, keypoints: int | None) -> dict[str, Any]:
     """Return the guarantee for the release of one image, and the parts that it does not cover."""
     epsilon, memoized = experiment.privacy.epsilon, experiment.defense.is_memoized()

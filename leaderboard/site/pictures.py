@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import os
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,8 +43,8 @@ def write_pairs(records: Iterable[LocatedRecord], out: Path) -> Iterator[tuple[R
 
 
 def _copy_picture(folder: Path, path: Path, out: Path) -> str | None:
-    """Copy an image of a folder of results. Returns None if there is none, or if a record's names lead out of the folder."""
-    if not path.is_file() or not path.resolve().is_relative_to(folder.resolve()):
+    """Copy an image of a folder of results. Returns None if there is none, or if a link leads out of the folder."""
+    if not os.path.isfile(path) or not path.resolve().is_relative_to(folder.resolve()):
         return None
     return _write_picture(path.read_bytes(), lambda: photographs.decode(path)[0], out)
 

@@ -1,11 +1,14 @@
 """Caches: entries are found by the hash of their inputs only, checked, and computed again if damaged."""
 
 import dataclasses
+import hashlib
+import json
 import os
 import resource
+import struct
 import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -296,6 +299,88 @@ def test_damaged_entries_are_reported_and_computed_again(cache_folder: Path, cap
     assert "checksum" in caplog.text
     assert "computed again" in caplog.text
     assert entry.find_fault() is None
+
+
+def edit_header(change: Callable[[dict[str, Any]], Any]) -> Callable[[bytes], bytes]:
+    """Return an edit of a safetensors file's header, which leaves the tensors as they are."""
+
+    def edit(content: bytes) -> bytes:
+        (size,) = struct.unpack("<Q", content[:8])
+        header = json.loads(content[8 : 8 + size])
+        header = json.dumps(change(header)).encode()
+        return struct.pack("<Q", len(header)) + header + content[8 + size :]
+
+    return edit
+
+
+def edit_metadata(**more: str | None) -> Callable[[bytes], bytes]:
+    """Return an edit of the metadata in the header; None removes an entry."""
+
+    def change(header: dict[str, Any]) -> dict[str, Any]:
+        metadata = header["__metadata__"] | more
+        return header | {"__metadata__": {name: value for name, value in metadata.items() if value is not None}}
+
+    return edit_header(change)
+
+
+DAMAGES = [
+    edit_metadata(meta=None),
+    edit_metadata(meta="{oops"),
+    edit_metadata(meta="[]"),
+    edit_metadata(meta='{"a": NaN}'),
+    edit_metadata(digest=None),
+    edit_metadata(kind=None),
+    edit_header(lambda header: {name: value for name, value in header.items() if name != "__metadata__"}),
+    edit_header(lambda header: header | {"numbers": header["numbers"] | {"dtype": "F8_E4M3", "shape": [8000]}}),
+    edit_header(lambda header: header | {"numbers": header["numbers"] | {"dtype": "BF16", "shape": [4000]}}),
+    edit_header(lambda header: []),
+    lambda content: b"",
+    lambda content: content[:4],
+    lambda content: b"\xff" * 8 + content[8:],
+    lambda content: content[:8] + b"\xff" + content[9:],
+    lambda content: content.replace(b"numbers", b"numb\xffrs"),
+]
+
+
+@pytest.mark.parametrize("damage", DAMAGES, ids=range(len(DAMAGES)))
+def test_a_damaged_header_is_detected_computed_again_and_pruned(
+    cache_folder: Path, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture, damage: Callable[[bytes], bytes]
+) -> None:
+    first, _ = store.fetch("a", 1, numbers)
+    assert first["numbers"].nbytes == 8000
+    (entry,) = store.list_entries()
+    whole = entry.path.read_bytes()
+    entry.path.write_bytes(damage(whole))
+    assert bench(capfd, "cache", "verify")[0] == 1
+    again, _ = store.fetch("a", 1, numbers)
+    np.testing.assert_array_equal(again["numbers"], first["numbers"])
+    assert "computed again" in caplog.text
+    assert entry.find_fault() is None
+    entry.path.write_bytes(damage(whole))
+    assert not store.copy_file("a", 1, cache_folder / "copy")
+    assert bench(capfd, "cache", "prune", "--damaged")[1].startswith("removed 1 entries")
+    assert not entry.path.exists()
+
+
+EMPTY = hashlib.sha256(b"").hexdigest().encode()
+
+
+@pytest.mark.parametrize(
+    "sums",
+    [b"", b"\xff\xfe\n", b"no-spaces\n", b"0  ../a/b\n", b"0  /etc/hostname\n", b"0  a\0b\n", EMPTY + b"  ../../outside\n"],
+)
+def test_damaged_checksums_of_a_folder_are_detected_and_pruned(
+    cache_folder: Path, capfd: pytest.CaptureFixture[str], sums: bytes
+) -> None:
+    folder = store.fetch_folder("models", "key", lambda folder: (folder / "a.txt").touch())
+    (cache_folder / "outside").touch()  # the last checksum is that of this file
+    (folder / store.SUMS).write_bytes(sums)
+    assert bench(capfd, "cache", "verify")[0] == 1
+    assert store.fetch_folder("models", "key", lambda folder: (folder / "a.txt").touch()) == folder
+    assert bench(capfd, "cache", "verify")[0] == 0
+    (folder / store.SUMS).write_bytes(sums)
+    assert bench(capfd, "cache", "prune", "--damaged")[1].startswith("removed 1 entries")
+    assert not folder.exists()
 
 
 def test_folders_are_stored_with_checksums(cache_folder: Path) -> None:

@@ -52,10 +52,33 @@ def test_infinity() -> None:
         to_fraction(Exact("inf"))
 
 
-@pytest.mark.parametrize("text", ["", "nan", "much", "1/0", "1e400", "1/2/3"])
+def test_exponents_at_the_limits_of_doubles() -> None:
+    assert to_fraction("1e308") == 10**308
+    assert to_fraction("5e-324") == Fraction(5, 10**324)
+    assert Exact("0." + "0" * 4000 + "1E4000") == 0.1
+    assert Exact("0E400000000").fraction == 0
+
+
+# Written out, the first three have 400 million digits, which takes hours.
+HUGE = ["1E400000000", "-1E400000000", "1E-400000000", "1E99999999999999999999", "1" * 5000, "1e-400"]
+
+
+@pytest.mark.parametrize("text", [*HUGE, "", "nan", "much", "1/0", "1e400", "1/2/3", "1E400000000/3", "sNaN"])
 def test_invalid_text(text: str) -> None:
     with pytest.raises(ValueError, match=r"."):
         Exact(text)
+
+
+@pytest.mark.parametrize("text", HUGE)
+def test_exponents_are_bounded_before_the_number_is_built(text: str) -> None:
+    with pytest.raises((ValueError, OverflowError)):
+        to_fraction(text)
+
+
+@pytest.mark.parametrize("text", HUGE[:3])
+def test_exponents_of_decimals_are_bounded(text: str) -> None:
+    with pytest.raises(OverflowError):
+        to_fraction(Decimal(text))
 
 
 def test_copy_is_exact() -> None:

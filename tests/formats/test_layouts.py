@@ -1,5 +1,6 @@
 """Scenes are written and read again in both layouts; errors of damaged files name file and line."""
 
+import dataclasses
 import re
 import shutil
 from collections.abc import Callable
@@ -185,6 +186,9 @@ LISTED = [
     (2, replace_field(0, "query/day/0.png"), r"query/day/0\.png occurs a second time; the first is line 1"),
     (1, replace_field(0, "query/day/absent.png"), r"there is no image .*absent\.png"),
     (1, replace_field(0, "db/0.png"), r"db/0\.png is a reference as well"),
+    (1, replace_field(0, "../ground_truth.txt"), r"expected a name of a file below .*, without '\.\.'"),
+    (1, replace_field(0, "/etc/hostname"), "expected a name of a file below"),
+    (1, replace_field(0, "x" * 300), "no name of a file is longer than 255 bytes"),
 ]
 POSES = [
     (1, lambda row: row + " 1", "expected qw qx qy qz tx ty tz, but there are 8 fields"),
@@ -235,6 +239,7 @@ def test_damaged_poses_are_refused(copies: dict[str, Path], line: int, change: C
         ("images", 9, replace_field(8, "77"), "there is no camera 77 in .*cameras.txt"),
         ("images", 7, replace_field(9, "db/0.png"), r"db/0\.png is in this model twice"),
         ("images", 5, replace_field(9, "db/absent.png"), r"there is no image .*absent\.png"),
+        ("images", 5, replace_field(9, "db/../../ground_truth.txt"), r"expected a name of a file below .*, without '\.\.'"),
     ],
 )
 def test_damaged_text_models_are_refused(copies: dict[str, Path], file: str, line: int, change: Callable, complaint: str) -> None:
@@ -382,3 +387,12 @@ def test_nothing_is_overwritten(original: Scene, written: dict[str, Path], tmp_p
         scene_export.write(original, "colmap", written["colmap"])
     with pytest.raises(UserError, match="--layout nerf: unknown layout; available: aachen, colmap"):
         scene_export.write(original, "nerf", tmp_path / "x")
+
+
+@pytest.mark.parametrize("layout", LOADERS)
+@pytest.mark.parametrize("name", ["../x.png", "a/../../../x.png", "/srv/x.png"])
+def test_no_image_is_written_outside_the_folder(original: Scene, tmp_path: Path, layout: str, name: str) -> None:
+    queries = (*original.queries[:-1], dataclasses.replace(original.queries[-1], name=name))
+    with pytest.raises(UserError, match="expected a name of a file below"):
+        scene_export.write(dataclasses.replace(original, queries=queries), layout, tmp_path / "deep" / "out")
+    assert list(tmp_path.iterdir()) == []

@@ -12,7 +12,7 @@ from scipy import stats
 
 from bench.core import table as core_table
 from bench.core.table import to_csv, to_latex, to_markdown
-from leaderboard import comparison
+from leaderboard import comparison, tables
 from leaderboard.comparison import ComparisonGroup
 from leaderboard.group_tables import GroupTable, build_pairs_table, build_ranking_table
 from leaderboard.identification import measure_bits
@@ -164,6 +164,24 @@ def test_strings_of_users_are_text_in_every_format(tmp_path: Path) -> None:
         assert count == (len(table.columns) - 1 if special == "&" else 0), (special, line)
     assert r"\input" not in body
     assert r"\textbackslash{}input\{z\}" in body
+
+
+def test_names_of_plugins_are_text_in_reports(tmp_path: Path) -> None:
+    """Also in headings of columns, in notes and in the source of report.md, where words keep their underscores."""
+    metrics = {"<img src=x>": 0.5, "[a](javascript:b)": 0.5, "my_own": 0.5, "*bold*": 0.5, "`code`|": 0.5, "_under": 0.5}
+    records = [fabricated.record("a", {"ssim": 0.5, "keypoints": 9} | metrics, defense=ldp(8.0))]
+    records.append(fabricated.record(HOSTILE, {}, defense=ldp(8.0), status="failed", reason=HOSTILE))
+    (plain,) = tables.build_tables(records)
+    assert {"<img src=x>", "my_own"} <= {column.label for column in plain.columns}
+    (group,) = comparison.build_groups(comparison.load_records(fabricated.write(tmp_path, records)))
+    for written in (to_markdown(plain, plain=True), to_markdown(plain), to_markdown(build_pairs_table(group))):
+        rows = [line for line in written.splitlines() if line.startswith("|")]
+        assert len({len(cells(line, r"(?<!\\)\|")) for line in rows}) == 1
+        assert not re.search(r"(?<!\\)[<`]", written)
+        assert not re.search(r"(?<!\\)\]\(javascript", written)
+        assert r"\*bold\*" in rows[0]
+        assert r"\_under" in rows[0]
+    assert "my_own" in to_markdown(plain, plain=True)
 
 
 def check_rows(table: GroupTable) -> None:

@@ -142,6 +142,7 @@ def test_false_values_of_one_record(faults: Callable[..., list[Fault]], honest: 
     [
         (change("defense", "name", to="lpd"), "unknown defense 'lpd'; did you mean 'ldp'?"),
         (change("defense", "subset_size", to="many"), "ldp: subset_size must be a whole number"),
+        (change("defense", "epsilon", to="1E400000000"), "ldp: epsilon must be a number or a fraction"),
         (change("defense", "dictionary", to="sha256:" + "0" * 64), "defense.dictionary is sha256:000"),
         (change("dataset", "hash", to="sha256:" + "0" * 64), "dataset.hash is sha256:000"),
         (change("metric_settings", "ssim", to={}), "metric_settings.ssim is {}"),

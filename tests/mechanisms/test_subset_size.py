@@ -150,6 +150,8 @@ def test_collected_recalls() -> None:
     records = [record(1, 2.0), record(2, 2.0004), record(2, 2.0), record(1, "inf"), record(2, "inf"), record(4, 3.0)]
     records += [record(2, 2.0, condition="night"), record(2, 2.0, status="failed"), record(2, 2.0, task_settings={"trials": 5})]
     assert collect_recalls(records, 2.0, 100, 30_000, "day") == ({1: [0.0], 2: [1.0, 1.0]}, [0.25])
+    thirds = [record(2, "1/3"), record(2, "much"), {**record(2, "1/3"), "metrics": {}}, record(1, "inf", metrics={"inliers": 3})]
+    assert collect_recalls([*thirds], 1 / 3, 100, 30_000, "day") == ({2: [1.0]}, [])
     with pytest.raises(UserError, match="no localization with ldp:epsilon=2 or inf, words=99"):
         collect_recalls(records, 2.0, 99, 30_000, "day")
 

@@ -1,6 +1,10 @@
 """Contract tests of every registered plugin, and controls that break the contract."""
 
+import ast
 import dataclasses
+import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +12,7 @@ import numpy as np
 import pytest
 from fakes import draw_texture
 
+from bench import testing
 from bench.api import Attack, Defense, Extractor, Metric, Privacy, View
 from bench.cache import store
 from bench.codebook import dictionary
@@ -152,3 +157,83 @@ def test_attack_that_reads_the_cache_is_detected(tmp_path: Path) -> None:
     for attack in (CachedFeatures(), CachedWords()):
         with pytest.raises(AssertionError, match="saw more"):
             check_attack(attack, LDP(dictionary=small), Sift(), draw_features())
+
+
+VIOLATIONS = """
+import dataclasses
+import numpy as np
+from test_contract import Careless, Leaky, Shifted
+from bench import testing
+from bench.api import Attack, Dataset, ImageAttack, Metric
+from bench.codebook.examples import draw_features
+from bench.codebook.public import Public
+from bench.extractors.sift import Sift
+from bench.images import photographs
+from bench.images.scene import Scene
+from bench.tasks.reconstruction import Reconstruction
+from bench.types import Descriptors
+from fakes import draw_texture
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Bright(ImageAttack):
+    accepts = (Descriptors,)
+    def reconstruct(self, view, rng):
+        return np.full((*view.release.size[::-1], 3), 2, np.float32)
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Narrow(Metric):
+    compares, unit, range, higher_is_better_for = "descriptors", "", (0.0, 0.5), "defender"
+    def __call__(self, truth, estimate):
+        return 1.0 - float(np.array_equal(truth, estimate))
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Empty(Dataset):
+    def scene(self):
+        return Scene(name="empty", references=(), queries=())
+
+class Ranked(Sift):
+    def extract(self, image, source=None):
+        features = super().extract(image, source)
+        parts = {name: getattr(features, name)[::-1] for name in ("keypoints", "descriptors", "codes")}
+        return dataclasses.replace(features, **parts)
+
+secret, image = draw_features(20), photographs.crop_square(draw_texture(0), 256)
+for check, arguments in (
+    (testing.check_defense, (Leaky(), Public(), secret)),
+    (testing.check_defense, (Shifted(), Public(), secret)),
+    (testing.check_defense, (Careless(), Public(), secret)),
+    (testing.check_attack, (Bright(), Leaky(), Sift(), secret)),
+    (testing.check_metric, (Narrow(),)),
+    (testing.check_extractor, (Ranked(), image)),
+    (testing.check_task, (Reconstruction(), Leaky(), Sift(), secret)),
+    (testing.check_dataset, (Empty(),)),
+):
+    try:
+        check(*arguments)
+    except AssertionError as error:
+        print(f"{check.__name__}: {error}")
+    else:
+        print(f"{check.__name__} did not notice")
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("options", [[], ["-O"], ["-OO"]], ids=str)
+def test_the_contract_holds_under_optimisation(options: list[str]) -> None:
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
+    command = [sys.executable, *options, "-c", VIOLATIONS]
+    lines = subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout.splitlines()
+    assert lines == [
+        "check_defense: the release shares memory with the secret",
+        "check_defense: the released keypoints differ from the secret ones",
+        "check_defense: the same rng gave another release",
+        "check_attack: the result has values above 1",
+        "check_metric: the value is outside the declared range",
+        "check_extractor: the order of keypoints would reveal their strength: return by_position()",
+        "check_task: check_task is for tasks that take no attack",
+        "check_dataset: the scene is empty",
+    ]
+
+
+def test_no_check_is_a_bare_assertion() -> None:
+    assert not [node for node in ast.walk(ast.parse(Path(str(testing.__file__)).read_text())) if isinstance(node, ast.Assert)]

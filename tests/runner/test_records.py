@@ -3,23 +3,24 @@
 import json
 import logging
 import math
+import re
 from pathlib import Path
 from typing import Any
 
 import pytest
+import record_lines
 
 import bench
+from bench import cli
 from bench.core.errors import UserError
-from bench.runner import records
+from bench.runner import directory, records
 from bench.runner.records import Log, read
 
 SCHEMA_1 = Path(__file__).resolve().parents[1] / "data" / "records-schema-1.jsonl"  # written by version 0.1
 
 
 def record(sample: str, **more: Any) -> dict[str, Any]:
-    metrics = {"ssim": 0.1 + 0.2}
-    entries = {"schema": 2, "run_hash": "r", "experiment_id": "c", "sample": sample, "status": "ok", "metrics": metrics, **more}
-    return records.seal(entries)
+    return record_lines.record(sample, **{"metrics": {"ssim": 0.1 + 0.2}, **more})
 
 
 def write(path: Path, *found: dict[str, Any]) -> Path:
@@ -75,16 +76,90 @@ def test_other_corrupt_lines_are_named(tmp_path: Path, line: bytes) -> None:
 @pytest.mark.slow
 def test_every_flipped_bit_is_found(tmp_path: Path) -> None:
     path = write(tmp_path / "r", record("a", metrics={"ssim": 0.58, "psnr": None}))
-    whole = path.read_bytes()
-    for position in range(len(whole) - 1):  # the last byte ends the line
+    line = path.read_bytes().removesuffix(b"\n")
+    for position in range(len(line)):
         for bit in range(8):
-            flipped = bytearray(whole)
+            flipped = bytearray(line)
             flipped[position] ^= 1 << bit
-            path.write_bytes(flipped)
-            if flipped[position] == ord("\n"):
-                continue  # two lines, and neither is JSON
-            with pytest.raises(UserError, match="line"):
-                read(path)
+            with pytest.raises(UserError, match="line"):  # noqa: PT012
+                for part in flipped.split(b"\n"):  # a flip can give two lines
+                    records._parse(path, 1, bytes(part))
+
+
+RECORD = record("a")
+PLUGIN = {"name": "ldp"}
+MISSHAPEN: list[Any] = [
+    {"schema": 1},
+    {"schema": True},
+    {"schema": 2},
+    [],
+    [[]],
+    None,
+    RECORD | {"environment": None},
+    RECORD | {"environment": {}},
+    RECORD | {"sample": ["a"]},
+    RECORD | {"run_hash": {}},
+    RECORD | {"experiment_id": 7},
+    RECORD | {"defense": "ldp"},
+    RECORD | {"defense": {"epsilon": 1}},
+    RECORD | {"attack": PLUGIN | {"inversion": {}}},
+    RECORD | {"dataset": None},
+    RECORD | {"dataset": {"name": "a", "hash": 1, "extractor": PLUGIN}},
+    RECORD | {"dataset": {"name": "a", "hash": "", "extractor": PLUGIN, "spec": []}},
+    RECORD | {"seed": True},
+    RECORD | {"seed": "0"},
+    RECORD | {"status": "good"},
+    RECORD | {"status": "failed"},
+    RECORD | {"reason": []},
+    RECORD | {"metrics": None},
+    RECORD | {"metrics": {"ssim": "high"}},
+    RECORD | {"metrics": {"ssim": True}},
+    RECORD | {"metric_settings": {"ssim": None}},
+    RECORD | {"privacy": {}},
+    RECORD | {"privacy": RECORD["privacy"] | {"epsilon_descriptor": "much"}},
+    RECORD | {"privacy": RECORD["privacy"] | {"uncovered": [1]}},
+    RECORD | {"notes": None},
+    RECORD | {"notes": [{}]},
+    RECORD | {"task_settings": []},
+    RECORD | {"condition": 1},
+    RECORD | {"estimates": {"pose": [1, 2]}},
+    {name: value for name, value in RECORD.items() if name != "notes"},
+]
+UNREADABLE = [
+    b"[" * 100_000,
+    b'{"a":' * 100_000,
+    json.dumps(RECORD).replace('"schema": 2', '"schema": 2, "deep": ' + "[" * 40 + "]" * 40).encode(),
+    json.dumps(RECORD | {"seed": 10**400}).encode(),
+    b'{"schema": 2, "seed": ' + b"9" * 5000 + b"}",
+    json.dumps(RECORD).replace("0.30000000000000004", "1e999").encode(),
+    json.dumps(RECORD).replace("0.30000000000000004", "NaN").encode(),
+]
+
+
+@pytest.mark.parametrize(
+    "line",
+    [*(json.dumps(records.seal(value) if isinstance(value, dict) else value).encode() for value in MISSHAPEN), *UNREADABLE],
+    ids=range(len(MISSHAPEN) + len(UNREADABLE)),
+)
+def test_lines_that_are_json_but_no_record_are_named_by_every_reader(
+    tmp_path: Path, line: bytes, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write(tmp_path / "records.jsonl", record("b"))
+    path.write_bytes(path.read_bytes() + line + b"\n")
+    (tmp_path / directory.PLAN).write_text("[]")
+    for arguments in (
+        ["leaderboard", "--results", path, "--out", tmp_path / "site"],
+        ["check", "--baseline", path, "--results", path],
+        ["status", "--results", tmp_path],
+        ["budget", "--image-epsilon", "1", "--words", "9", "--results", path],
+    ):
+        assert cli.main(list(map(str, arguments))) == 2, arguments
+        assert "records.jsonl, line 2: " in capsys.readouterr().err
+    with pytest.raises(UserError, match="line 2"):
+        Log(path)
+    assert not (tmp_path / "site").exists()
+    assert cli.main(["submit-check", str(path), "--sample", "0"]) == 1
+    assert re.search("^line 2: ", capsys.readouterr().out, re.MULTILINE)
 
 
 def test_records_of_schema_1_are_read_under_their_new_names() -> None:
@@ -135,7 +210,7 @@ def test_full_disk_loses_no_written_record() -> None:
 
 
 def test_dataframe_has_flat_columns_and_the_latest_records(tmp_path: Path) -> None:
-    old = record("a", status="failed", defense={"name": "ldp", "epsilon": "inf"})
+    old = record("a", status="failed", reason="tired", defense={"name": "ldp", "epsilon": "inf"})
     new = record("a", defense={"name": "ldp", "epsilon": "inf"})
     write(tmp_path / "records.jsonl", old, record("b", metrics={"psnr": None}), new)
     frame = bench.load_records(tmp_path)

@@ -3,6 +3,7 @@
 import copy
 import gc
 import json
+import os
 import re
 import shutil
 import weakref
@@ -27,7 +28,7 @@ from bench.core.errors import UserError
 from bench.datasets.gallery import Gallery
 from bench.mechanisms import composition
 from bench.runner import directory, engines, execute
-from bench.runner.records import FILE, Record
+from bench.runner.records import FILE, Record, seal
 from bench.runner.trial import TrialRunner
 from bench.settings import Asset
 from bench.task_api import Task
@@ -36,6 +37,7 @@ from bench.threat_model import DefenseDatabase, PublicDatabase, ServerMap
 from defenses.affine import Affine
 from defenses.ldp import LDP
 from defenses.none import Undefended
+from leaderboard import run_report
 
 RECONSTRUCTION = Reconstruction(inverter="sketch")
 
@@ -214,6 +216,42 @@ def test_unreadable_photograph_is_a_failed_record_and_the_others_are_run(images:
     assert records[2]["privacy"]["epsilon_image_optimal"] is None
 
 
+@pytest.mark.slow
+def test_odd_names_of_photographs_end_no_run(images: Path, tmp_path: Path) -> None:
+    texture = (images / "0.png").read_bytes()
+    (images / "x.png.png").mkdir()
+    names = ["m" + "x" * 250 + ".png", "nul.png", "x.png", "x.png.png/y.png", os.fsdecode(b"caf\xe9.png")]
+    for number, name in enumerate(names):
+        (images / name).write_bytes(texture + bytes([number]))  # photographs of one content would share a release
+    out = tmp_path / "out"
+    records = run([Undefended()], [Sketch()], images, out=out)
+    assert [record["status"] for record in records] == ["ok"] * 7
+    assert {record["sample"] for record in records} == {*names, "0.png", "1.png"}
+    assert all(directory.reconstruction_path(out, record).is_file() for record in records)
+    assert all(directory.photograph_path(out, record).is_file() for record in records)
+    assert len(list((out / "reconstructions").rglob("*.png"))) == 7 + 1  # the folder x.png.png is not one of them
+    run_report.write(records, out, "bench run")
+    assert all(directory.figure_path(out, record["sample"]).is_file() for record in records)
+    before = (out / FILE).read_bytes()
+    assert run([Undefended()], [Sketch()], images, out=out) == records  # it can be resumed
+    assert (out / FILE).read_bytes() == before
+
+
+def test_a_picture_that_cannot_be_written_fails_its_sample_alone(images: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    whole = run([Undefended()], [Sketch()], images)
+    taken = directory.reconstruction_path(out, whole[0])
+    taken.mkdir(parents=True)  # a folder in its place
+    records = run([Undefended()], [Sketch()], images, out=out)
+    assert [record["status"] for record in records] == ["failed", "ok"]
+    assert "picture cannot be written" in records[0]["reason"]
+    assert records[0]["metrics"] == {}
+    assert records[0]["privacy"]["keypoints"] is None
+    assert [line["status"] for line in map(json.loads, (out / FILE).read_text().splitlines())] == ["failed", "ok"]
+    taken.rmdir()
+    assert judged(run([Undefended()], [Sketch()], images, out=out)) == judged(whole)
+
+
 def test_broken_plugin_fails_its_own_experiments_and_leaves_a_traceback(images: Path, tmp_path: Path) -> None:
     records = run([Broken(), Undefended()], [Sketch()], images, out=tmp_path / "out")
     assert [record["status"] for record in records] == ["failed", "ok", "failed", "ok"]
@@ -341,6 +379,57 @@ def test_damaged_records_stop_the_run_before_it_starts(images: Path, tmp_path: P
     with pytest.raises(UserError, match="line 1"):
         run([Undefended()], [Sketch()], images, out=tmp_path / "out")
     assert file.read_bytes() == b"nonsense\n{}\n"
+
+
+def edit(*path: str, to: Any) -> Callable[[Record], None]:
+    def change(record: Record) -> None:
+        *above, last = path
+        for part in above:
+            record = record[part]
+        record[last] = to
+
+    return change
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        (edit("metrics", "ssim", to=8.58), "metrics.ssim: 8.58 is outside the range from -1 to 1"),
+        (edit("metrics", "mae_background", to=-0.1), "metrics.mae_background: -0.1 is outside the range from 0 to 1"),
+        (edit("metrics", "keypoints", to=1), "privacy.keypoints: differs from metrics.keypoints"),
+        (edit("defense", to={"name": "ldp"}), "defense: is {'name': 'ldp'}, planned is {'name': 'none'"),
+        (edit("attack", "brightness", to=0.5), "attack: is "),
+        (edit("dataset", "hash", to="sha256:0"), "dataset: is "),
+        (edit("seed", to=7), "seed: is 7, planned is 0"),
+        (edit("task_settings", "inverter", to="dia"), "task_settings: is "),
+        (edit("metric_settings", "ssim", to={}), "metric_settings: is "),
+        (edit("environment", "threads", to=64), "environment: is "),
+        (edit("sources", "defense", to=None), "sources: is "),
+        (edit("experiment_id", to="0" * 16), "experiment_id: is 0000000000000000"),
+        (edit("condition", to="night"), "condition: is night, planned is None"),
+        (edit("privacy", "guarantee", to="perfect"), "privacy.guarantee: is perfect, should be none"),
+        (edit("privacy", "epsilon_image", to=1.0), "privacy.epsilon_image: is 1.0, should be None"),
+        (lambda record: record.update(status="n/a", reason="no"), "status: the pair applies, but the record says n/a"),
+    ],
+)
+def test_a_held_record_that_contradicts_the_plan_stops_the_run(images: Path, tmp_path: Path, change: Any, complaint: str) -> None:
+    file = tmp_path / "out" / FILE
+    first = run([Undefended()], [Sketch()], images, out=tmp_path / "out")
+    changed = copy.deepcopy(first[1])
+    change(changed)
+    file.write_text(json.dumps(first[0]) + "\n\n" + json.dumps(seal(changed)) + "\n")  # the digest is right
+    before = file.read_bytes()
+    with pytest.raises(UserError, match=re.escape(f"{FILE}, line 3: {complaint}")):
+        run([Undefended()], [Sketch()], images, out=tmp_path / "out")
+    assert file.read_bytes() == before
+
+
+@pytest.mark.slow
+def test_a_run_is_resumed_from_a_folder_of_another_name(images: Path, tmp_path: Path) -> None:
+    first = run([Undefended()], [Sketch()], images, out=tmp_path / "out")
+    renamed = images.rename(tmp_path / "renamed")
+    assert run([Undefended()], [Sketch()], renamed, out=tmp_path / "out") == first
 
 
 # ---- one device, several releases

@@ -435,6 +435,33 @@ def test_commands_of_the_documentation_parse(line: str) -> None:
     assert all(getattr(args, option) for option in args.required)
 
 
+@pytest.mark.slow
+def test_the_scheduler_of_the_documentation_listens_on_loopback_alone(tmp_path: Path) -> None:
+    pytest.importorskip("distributed", reason="needs dask.distributed: pip install distributed")
+    if not Path("/proc/net/tcp").is_file():
+        pytest.skip("needs /proc, to see where a process listens")
+    (line,) = re.findall(r"^dask scheduler (--.*127\.0\.0\.1.*)$", DOCUMENT.partition("### Several machines")[0], re.MULTILINE)
+    (worker,) = re.findall(r"^dask worker (.*)$", DOCUMENT.partition("### Several machines")[0], re.MULTILINE)
+    assert "--host 127.0.0.1" in worker
+    assert "--dashboard-address 127.0.0.1:" in worker
+    assert find_listeners(line) == {"0100007F"}  # 127.0.0.1
+    assert find_listeners(line.replace("--dashboard-address 127.0.0.1:0", "--dashboard-address :0")) != {"0100007F"}
+
+
+def find_listeners(options: str) -> set[str]:
+    """Start a scheduler of dask with these options and a free port, and return the addresses on which it listens."""
+    command = [sys.executable, "-m", "distributed.cli.dask_scheduler", *options.replace("8786", "0").split()]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as scheduler:
+        assert scheduler.stderr is not None
+        assert any("dashboard at" in line for line in scheduler.stderr)
+        links = (os.readlink(link) for link in Path(f"/proc/{scheduler.pid}/fd").iterdir())
+        sockets = {link.removeprefix("socket:[").removesuffix("]") for link in links if link.startswith("socket:")}
+        tables = (Path(f"/proc/{scheduler.pid}/net/{table}") for table in ("tcp", "tcp6"))
+        rows = [row.split() for table in tables if table.is_file() for row in table.read_text().splitlines()[1:]]
+        scheduler.kill()
+    return {row[1].partition(":")[0] for row in rows if row[9] in sockets and row[3] == "0A"}  # 0A: it listens
+
+
 def test_suite_of_the_documentation(images: Path) -> None:
     code = next(block for block in re.findall(r"```python\n(.*?)```", DOCUMENT, re.DOTALL) if "SUITE" in block)
     names: dict[str, Any] = {}

@@ -15,7 +15,7 @@ examples:
   bench sweep smoke
   bench sweep paper-table-1 --workers 2
   bench sweep mine.py:SUITE --images DIR --out runs/mine
-  bench sweep full --engine dask --scheduler tcp://HOST:8786
+  bench sweep full --engine dask --scheduler tcp://127.0.0.1:8786
 """
 REQUIRED = ()
 

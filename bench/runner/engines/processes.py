@@ -10,6 +10,7 @@ from concurrent.futures.process import BrokenProcessPool
 from typing import Any
 
 from bench.core import environment, threads
+from bench.core.child_process import end_with_parent
 from bench.core.errors import UserError
 from bench.runner.engines import worker
 from bench.runner.engines.base import Engine, Job, run_as_completed, write_message
@@ -54,4 +55,5 @@ class Processes(Engine):
 
 
 def _start_worker() -> None:
+    end_with_parent()
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # a terminal sends Ctrl-C to all processes; this one ends without a traceback
