@@ -24,6 +24,7 @@ from bench.types import Bytes, Descriptors, Floats, WordSets
 
 SIFT = 128  # components
 NORM = 512.0  # of 8-bit SIFT, as COLMAP quantises unit vectors
+ROUNDING = 0.5 / NORM  # the greatest change of a component by quantisation
 HALF = 0.5  # hloc puts the centre of the first pixel at (0, 0)
 
 
@@ -82,11 +83,17 @@ def write_colmap(images: Sequence[ImageFeatures], out: Path) -> None:
     Raises
     ------
     UserError
-        if COLMAP cannot read one of the images; no file is left.
+        if descriptors have negative components, or COLMAP cannot read one of the images; no file is left.
     """
     import pycolmap
 
     root = _find_root(images)
+    for image in images:
+        if image.descriptors.min(initial=0.0) < -ROUNDING:
+            raise UserError(
+                f"{image.name}: descriptors have negative components, and those of --layout colmap are 8-bit without a sign, "
+                "as SIFT; give --layout hloc"
+            )
     with pycolmap.Database.open(out):
         pass  # import_images needs an existing database
     names = [image.name for image in images]

@@ -23,6 +23,7 @@ from bench.extractors.hloc import Hloc
 from bench.extractors.sift import Sift
 from bench.formats import pairs as hloc_pairs
 from bench.formats.stored_features import map_into_square, map_out_of_square
+from bench.geometry.nearest_words import unit_rows
 from bench.images import photographs
 from bench.images.photographs import Source
 from bench.testing import check_extractor
@@ -180,6 +181,25 @@ def test_exported_database_is_read_by_colmap_and_by_us(images: Path, tmp_path: P
     assert ours.codes is not None
     np.testing.assert_allclose(back.codes.astype(int), ours.codes.astype(int), atol=2)  # SIFT's norm is 512 but for rounding
     check_extractor(ColmapDatabase(path=out), pixels, Source("street/a.png", path))
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_signed_descriptors_are_not_exported_to_colmap(
+    images: Path, tmp_path: Path, rng: np.random.Generator, capfd: pytest.CaptureFixture[str], sign: int
+) -> None:
+    """A database would hold zeros in place of their negative components."""
+    rows = unit_rows(rng.random((1, 128), np.float32))
+    rows[0, 0] *= sign
+    with h5py.File(tmp_path / "features.h5", "w") as opened:
+        for name in ("street/a.png", "b.png"):
+            group = opened.create_group(name)
+            group["keypoints"], group["descriptors"] = np.array([[150.0, 100.0]]), rows.T
+            group["image_size"] = np.array([300 + (name == "b.png"), 200])
+    out = tmp_path / "database.db"
+    code = export("--images", images, "--extractor", f"hloc:path={tmp_path / 'features.h5'}", "--layout", "colmap", "--out", out)
+    error = capfd.readouterr().err
+    assert (code, out.exists()) == ((0, True) if sign == 1 else (2, False))
+    assert ("descriptors have negative components" in error) == (sign == -1)
 
 
 def test_features_of_colmap_are_read(tmp_path: Path) -> None:
