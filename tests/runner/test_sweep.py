@@ -3,10 +3,11 @@
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -266,6 +267,31 @@ def test_a_worker_with_other_files_is_refused(images: Path, tmp_path: Path, clus
     write_album(images, 4)
     with pytest.raises(UserError, match="other source, libraries or files"):
         list(execute.execute([plan], tmp_path / "out", engine))
+
+
+@dataclass(frozen=True)
+class EndsReader:
+    """Kills the first process that unpickles it. Later ones receive an attack."""
+
+    marker: Path
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _end_first_process, (self.marker,)
+
+
+def _end_first_process(marker: Path) -> Sketch:
+    if not marker.exists():
+        marker.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return Sketch()
+
+
+@pytest.mark.slow
+def test_a_worker_that_ends_before_it_is_described_is_started_again(tmp_path: Path, cluster: Any) -> None:
+    marker = tmp_path / "ended"
+    described = engines.choose_engine(kind="dask", scheduler=cluster.scheduler_address).describe([EndsReader(marker)])
+    assert marker.exists()
+    assert described == engines.choose_engine(kind="dask", scheduler=cluster.scheduler_address).describe([Sketch()])
 
 
 @pytest.mark.slow

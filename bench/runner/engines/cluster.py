@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
+import time
 from collections.abc import Iterable, Iterator
 from concurrent.futures import CancelledError
 from typing import TYPE_CHECKING, Any
@@ -29,15 +31,20 @@ class Cluster(Engine):
         self._scheduler = scheduler
 
     def describe(self, plugins: Iterable[object]) -> dict[str, Any]:
+        deadline = time.monotonic() + PATIENCE
+        environments: dict[str, Any] = {}
         with self._client() as client:
-            try:
-                client.wait_for_workers(1, timeout=PATIENCE)
-            except TimeoutError:
-                raise UserError(f"--scheduler {self._scheduler}: the scheduler has no workers; start some") from None
-            several = [address for address, count in client.nthreads().items() if count != 1]
-            if several:
-                raise UserError(f"worker {several[0]} executes several jobs at a time; start workers with --nthreads 1")
-            environments = client.run(worker.describe_environment, list(plugins), THREADS)
+            from distributed.comm import CommClosedError
+
+            while not environments:  # a worker may end before it has answered, and its nanny starts another
+                if (left := deadline - time.monotonic()) <= 0:
+                    raise UserError(f"--scheduler {self._scheduler}: the scheduler has no workers; start some")
+                with contextlib.suppress(TimeoutError, CommClosedError):
+                    client.wait_for_workers(1, timeout=left)
+                    several = [address for address, count in client.nthreads().items() if count != 1]
+                    if several:
+                        raise UserError(f"worker {several[0]} executes several jobs at a time; start workers with --nthreads 1")
+                    environments = client.run(worker.describe_environment, list(plugins), THREADS)
         (first, reference), *rest = environments.items()
         for address, other in rest:
             for name in reference:
