@@ -6,7 +6,8 @@ Method:
 
 1. Encode each keypoint of the release: the descriptor, the m words, or the parameters of the subspace. The random origin and
    basis of a subspace are noise and no part of the encoding `invariant` (`bench/inversion/encoding.py`).
-2. The network reconstructs the photograph from the encoded keypoints.
+2. The network reconstructs the photograph from the encoded keypoints. For word sets, the context model of the attack `context`
+   first computes the posterior of each candidate, and the network weighs the candidates by it.
 3. If the extractor declares how descriptors change when the photograph is mirrored or rotated, repeat both steps for all eight
    symmetries and average the reconstructions.
 
@@ -19,7 +20,7 @@ apply.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,12 +28,13 @@ import numpy as np
 
 from bench.api import Defense, Extractor, ImageAttack, View
 from bench.codebook.public import ASSETS, Public
+from bench.context import weights as context
 from bench.core.errors import UserError
-from bench.inversion.symmetry import find_symmetries
+from bench.inversion.symmetry import Symmetry, find_symmetries
 from bench.inversion.weights import Network, explain_incompatible, load
 from bench.settings import Asset
 from bench.threat_model import PublicAssets
-from bench.types import Descriptors, Floats, Subspaces, WordSets
+from bench.types import Descriptors, Floats, Release, Subspaces, WordSets
 
 # File names of the shipped networks. As printed: the input is the words of a set, or origin and basis of a subspace, stacked.
 SHIPPED = {"shipped": "inversion-*.safetensors", "shipped-as-printed": "as-printed-*.safetensors"}
@@ -51,15 +53,21 @@ class DIA(ImageAttack):
         return _choose(self.weights, defense, extractor, public)[1]
 
     def assets(self, defense: Defense, extractor: Extractor, public: Public) -> Mapping[str, str]:
-        return {"weights": self._network(defense, extractor, public).verify()}
+        network = self._network(defense, extractor, public)
+        if network.meta["encoding"] == "posteriors":
+            _load_context(network).verify()
+        return {"weights": network.verify()}  # its metadata have the digest of the context model
 
     def reconstruct(self, view: View, rng: np.random.Generator) -> Floats:
         from bench.inversion.encoding import encode_settings
         from bench.inversion.reconstruct import reconstruct_image
 
-        network = self._network(view.defense, view.extractor, view.know(PublicAssets).assets)
+        public = view.know(PublicAssets).assets
+        network = self._network(view.defense, view.extractor, public)
         settings = encode_settings(view.defense, network.supported_settings)
         symmetries = find_symmetries(view.extractor)
+        if network.meta["encoding"] == "posteriors":
+            return _weigh_and_reconstruct(network, view.release, view.defense, symmetries, public)
         return reconstruct_image(
             network.module, view.release, symmetries, settings, network.meta["slots"], network.meta["encoding"]
         )
@@ -69,6 +77,33 @@ class DIA(ImageAttack):
         if path is None:
             raise UserError(f"dia: {reason}")
         return load(path)
+
+
+def _weigh_and_reconstruct(
+    network: Network, release: Release, defense: Defense, symmetries: Sequence[Symmetry], public: Public
+) -> Floats:
+    """Reconstruct with the posteriors of the context model that the network was trained with."""
+    from bench.context.encoding import prior_odds
+    from bench.context.reconstruct import reconstruct_from_posteriors
+
+    if not isinstance(release, WordSets):
+        raise TypeError(f"{network.path} reads WordSets, got {type(release).__name__}")
+    odds = prior_odds(defense, public, release.subset_size)
+    return reconstruct_from_posteriors(network.module, _load_context(network).module, release, odds, symmetries)
+
+
+def _load_context(network: Network) -> context.Network:
+    """Load the context model that a network was trained with.
+
+    Raises
+    ------
+    UserError
+        if the installed one is another.
+    """
+    installed = context.load(ASSETS / "context.safetensors")
+    if installed.digest != network.meta["context"]:
+        raise UserError(f"dia: {network.path} was trained with another context model than {installed.path}; reinstall")
+    return installed
 
 
 def _choose(asset: str, defense: Defense, extractor: Extractor, public: Public) -> tuple[Path | None, str | None]:

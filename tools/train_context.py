@@ -7,13 +7,14 @@ The training photographs are the third of `train/` that the shipped dictionary w
 from __future__ import annotations
 
 import argparse
+import math
 from pathlib import Path
 
 from make_assets import split_photographs
 
 from bench.codebook.public import ASSETS, Public
 from bench.context.network import Shape
-from bench.context.train import build_sampler, fit, validate
+from bench.context.train import Stage, build_sampler, compute_loss, compute_pair_loss, fit, validate
 from bench.context.weights import save
 from bench.extractors.sift import Sift
 from bench.images.photographs import SIDE, list_photographs
@@ -22,6 +23,7 @@ from bench.inversion.data import assign_dictionaries, measure_quantisation_error
 from bench.inversion.plan import Training
 from bench.inversion.train import check_quantisation
 from bench.inversion.weights import describe
+from bench.settings import OneOf
 from defenses.ldp import LDP
 
 SUPPORTED = {field: LDP.supported_settings[field] for field in ("epsilon", "subset_size")}
@@ -33,16 +35,23 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--work", type=Path, required=True)
     parser.add_argument("--out", type=Path, default=ASSETS / "context.safetensors")
-    parser.add_argument("--steps", type=int, default=2000, help="of two training samples each")
+    parser.add_argument("--pair-steps", type=int, default=4000, help="of the first stage, each of two training samples")
+    parser.add_argument("--steps", type=int, default=4000, help="of the second stage, each of two training samples")
     args = parser.parse_args()
     folders = split_photographs(args.data, args.work / "photographs")
     views, unseen = (
         collect_views(list_photographs(folders[name]), Sift())[::2] for name in ("2", "tune")
     )  # without mirrored ones
-    train(views, [view for view in unseen if len(view.pixels) == SIDE], args.out, Training(steps=args.steps, batch=2))
+    train(
+        views,
+        [view for view in unseen if len(view.pixels) == SIDE],
+        args.out,
+        Training(steps=args.steps, batch=2),
+        args.pair_steps,
+    )
 
 
-def train(views: list[PhotographView], unseen: list[PhotographView], out: Path, training: Training) -> None:
+def train(views: list[PhotographView], unseen: list[PhotographView], out: Path, training: Training, pair_steps: int) -> None:
     defense, shape, public = LDP(), Shape(), Public()
     all_views = [*views, *unseen]
     dictionaries = assign_dictionaries({view.photograph for view in all_views}, [defense.dictionary], public)
@@ -52,12 +61,18 @@ def train(views: list[PhotographView], unseen: list[PhotographView], out: Path, 
         "validation": measure_quantisation_error(unseen, dictionaries, public),
     }
     check_quantisation(**errors)
-    draw = build_sampler(views, defense, SUPPORTED, "subset_size", public, shape.neighbours, training.batch)
-    module, secrets = fit(shape, draw, training), [view.features for view in unseen]
+    given = views, defense
+    size = "subset_size", public, shape.neighbours, training.batch
+    pairs = {"epsilon": OneOf((math.inf,)), "subset_size": OneOf((2,))}
+    stages = [
+        Stage(draw=build_sampler(*given, pairs, *size), loss=compute_pair_loss, steps=pair_steps),
+        Stage(draw=build_sampler(*given, SUPPORTED, *size), loss=compute_loss, steps=training.steps),
+    ]
+    module, secrets = fit(shape, stages, training), [view.features for view in unseen]
     meta = {
         **describe(defense, dict(SUPPORTED), Sift(), Public()),
         "photographs": sorted({view.photograph for view in views}),
-        "crops": training.steps * training.batch,
+        "crops": (pair_steps + training.steps) * training.batch,
         "batch": training.batch,
         "rate": training.rate,
         "seed": training.seed,

@@ -44,23 +44,37 @@ def build_graph(releases: Sequence[WordSets], odds: Sequence[float], neighbours:
     """Return one graph of several releases with equally many candidates per keypoint. No edge connects two releases."""
     import torch
 
-    neighbour_indices, offsets, present, positions = [], [], [], []
+    neighbour_indices, offsets, present, positions, spacing = [], [], [], [], []
     start = 0
     for release in releases:
         nearest, exists = find_nearest_keypoints(release.keypoints, neighbours)  # (N, k) twice
         neighbour_indices.append(nearest + start)
         present.append(exists)
-        offsets.append(release.keypoints[nearest] - release.keypoints[:, None])
+        offsets.append((release.keypoints[nearest] - release.keypoints[:, None]) * exists[:, :, None])
+        spacing.append(np.log1p(np.linalg.norm(offsets[-1], axis=2).max(axis=1)))
         positions.append(2 * release.keypoints / np.array(release.size, dtype=np.float32) - 1)
         start += len(release)
+    indices, edges = np.concatenate(neighbour_indices), np.concatenate(present)
     return KeypointGraph(
         candidates=torch.from_numpy(np.concatenate([release.candidates for release in releases])),
         odds=torch.from_numpy(np.repeat(np.array(odds, dtype=np.float32), [len(release) for release in releases])),
         positions=torch.from_numpy(np.concatenate(positions).astype(np.float32)),
-        neighbours=torch.from_numpy(np.concatenate(neighbour_indices)),
+        spacing=torch.from_numpy(np.concatenate(spacing).astype(np.float32)),
+        neighbours=torch.from_numpy(indices),
         offsets=torch.from_numpy(np.concatenate(offsets)),
-        present=torch.from_numpy(np.concatenate(present)),
+        present=torch.from_numpy(edges),
+        reverse=torch.from_numpy(find_reverse_edges(indices, edges)),
     )
+
+
+def find_reverse_edges(neighbours: Indices, present: Floats) -> Indices:
+    """Return the flat index of the edge from each neighbour back to the keypoint; P k if there is none. (P, k) twice -> (P, k)"""
+    count, k = neighbours.shape
+    forward = np.where(present > 0, np.arange(count)[:, None] * count + neighbours, -1).ravel()
+    backward = (neighbours * count + np.arange(count)[:, None]).ravel()
+    order = np.argsort(forward, kind="stable")
+    found = order[np.minimum(np.searchsorted(forward[order], backward), len(order) - 1)]
+    return np.where((forward[found] == backward) & (present.ravel() > 0), found, count * k).reshape(count, k)
 
 
 def find_nearest_keypoints(keypoints: Floats, neighbours: int) -> tuple[Indices, Floats]:

@@ -3,11 +3,12 @@
 The model is a pairwise Markov field. The state of a keypoint is one of its m candidates, or none of them. The evidence of one
 candidate is its prior odds and its frequency at that position. A pair of candidates of two keypoints has the log-ratio
 
-    log P(w, w' | Δ) / P(w) P(w') = q(w) · (g(Δ) ∘ k(w'))
+    log P(w, w' | Δ) / P(w) P(w') = log mean_s exp(q_s(w) · (g_s(Δ) ∘ k_s(w')) + b_s(Δ)),
 
-of low rank, with Δ the displacement between the two. SIFT is upright, so direction and distance are both informative. "None" has
-ratio 1 with every candidate, since wrong words are uniform. Belief propagation passes messages between neighbours. Loops in the
-graph count evidence twice, so each message has a learned weight in [0, 1], its trust.
+with Δ the displacement between the two. Each s is a component of low rank: the scales of the two keypoints are unknown, and a
+pair looks different at each combination of scales. SIFT is upright, so direction and distance are both informative. "None" has
+ratio 1 with every candidate, since wrong words are uniform. Belief propagation passes messages between neighbours. Loops in
+the graph count evidence twice, so each message has a learned weight in [0, 1], its trust.
 
 Further layers combine more than two keypoints. They gather the beliefs of neighbours with learned functions of the displacement.
 They update the odds of the candidates, and predict the descriptor for the case that no candidate is the true word.
@@ -22,10 +23,11 @@ import torch
 import torch.nn.functional as nnf
 from torch import Tensor, nn
 
-FREQUENCIES = (1.0, 2.0, 4.0)  # of a displacement's length on a logarithmic scale
+FREQUENCIES = (1.0, 2.0, 3.0, 4.0, 6.0)  # of a displacement's length on a logarithmic scale
 MAX_DISTANCE = 64.0  # pixels; longer displacements are clamped
 MAX_LOG_RATIO = 8.0  # limit of a log-ratio in both directions
 HIDDEN = 64  # width of the embedding of a displacement
+DAMPING = 0.5  # weight of the previous message in belief propagation
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,12 +35,14 @@ class Shape:
     """The network's sizes."""
 
     length: int = 128  # D, of a descriptor
-    width: int = 64
-    rank: int = 32  # of the log-ratios
-    neighbours: int = 16
-    rounds: int = 3  # of belief propagation
+    width: int = 96
+    hidden: int = 384  # of the embedding of a word
+    rank: int = 32  # of the log-ratios, for each component
+    components: int = 4
+    neighbours: int = 20
+    rounds: int = 6  # of belief propagation
     layers: int = 2  # that gather the beliefs of neighbours
-    kernels: int = 8  # functions of displacement per layer
+    kernels: int = 6  # functions of displacement per layer
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,9 +52,11 @@ class KeypointGraph:
     candidates: Tensor  # (P, m, D) unit norm
     odds: Tensor  # (P,) prior log odds of a candidate over none
     positions: Tensor  # (P, 2) in [-1, 1]
+    spacing: Tensor  # (P,) log of the distance to the farthest neighbour, in pixels
     neighbours: Tensor  # (P, k) int64, the nearest other keypoints
     offsets: Tensor  # (P, k, 2) pixels from a keypoint to those
     present: Tensor  # (P, k) float32, 1 for neighbours that exist, else 0
+    reverse: Tensor  # (P, k) int64, flat index in (P, k) of the edge back from a neighbour; P k if there is none
 
     def to(self, device: torch.device) -> KeypointGraph:
         return KeypointGraph(*(value.to(device) for value in vars(self).values()))
@@ -84,31 +90,49 @@ class ContextModel(nn.Module):
 
     def __init__(self, shape: Shape) -> None:
         super().__init__()
-        width = shape.width
+        width, projected = shape.width, shape.components * shape.rank
         self.shape = shape
         self.scale = shape.length**0.5  # so that an element of a candidate is about 1
-        self.embed = nn.Sequential(nn.Linear(shape.length, 2 * width), nn.SiLU(), nn.Linear(2 * width, width))
-        self.here = nn.Sequential(nn.Linear(3, 32), nn.SiLU(), nn.Linear(32, width))
-        self.shift = nn.Sequential(nn.Linear(4 + 4 * len(FREQUENCIES), HIDDEN), nn.SiLU(), nn.Linear(HIDDEN, HIDDEN), nn.SiLU())
-        self.alone = nn.Linear(width, 1)
-        self.query, self.key = nn.Linear(width, shape.rank), nn.Linear(width, shape.rank)
-        self.gate, self.trust = nn.Linear(HIDDEN, shape.rank), nn.Linear(HIDDEN, 1)
+        self.embed = nn.Sequential(nn.Linear(shape.length, shape.hidden), nn.SiLU(), nn.Linear(shape.hidden, width))
+        self.here = nn.Sequential(nn.Linear(4, 32), nn.SiLU(), nn.Linear(32, width))
+        lengths = 4 + len(FREQUENCIES) * 6
+        self.shift = nn.Sequential(nn.Linear(lengths, HIDDEN), nn.SiLU(), nn.Linear(HIDDEN, HIDDEN), nn.SiLU())
+        self.query, self.key = nn.Linear(width, projected), nn.Linear(width, projected)
+        self.gate, self.bias, self.trust = nn.Linear(HIDDEN, projected), nn.Linear(HIDDEN, shape.components), nn.Linear(HIDDEN, 1)
         self.layers = nn.ModuleList(Gather(width, shape.kernels) for _ in range(shape.layers))
         self.expect = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, shape.length))
-        for layer in (self.alone, self.query):
+        last = nn.Linear(width, 1)
+        self.alone = nn.Sequential(nn.Linear(width, width), nn.SiLU(), last)
+        for layer in (last, self.query, self.bias):  # untrained, the network returns the prior
             nn.init.zeros_(layer.weight)
             nn.init.zeros_(layer.bias)
 
     def forward(self, graph: KeypointGraph) -> Belief:
-        words = self.embed(graph.candidates * self.scale)  # (P, m, width)
-        state = self.here(torch.cat([graph.positions, graph.odds[:, None] / 4], dim=1))  # (P, width)
+        words, state = self.embed_words(graph.candidates), self.embed_positions(graph)
         shift = self.shift(encode_offsets(graph.offsets))  # (P, k, HIDDEN)
-        alone = graph.odds[:, None] + self.alone(nnf.silu(words + state[:, None]))[:, :, 0]  # (P, m)
+        alone = graph.odds[:, None] + self.rate_alone(words, state)  # (P, m)
+        ratios = self.log_ratios(words, shift, graph.neighbours)
         trust = torch.sigmoid(self.trust(shift))[:, :, 0] * graph.present  # (P, k)
-        odds = propagate(alone, self.log_ratios(words, shift, graph.neighbours), trust, graph.neighbours, self.shape.rounds)
+        odds = propagate(alone, ratios, trust, graph.neighbours, graph.reverse, self.shape.rounds)
         for layer in self.layers:
             odds, state = layer(words, odds, state, shift, graph)
         return Belief(odds, self.expect(state) / self.scale)
+
+    def embed_words(self, candidates: Tensor) -> Tensor:
+        """(P, m, D) -> (P, m, width)"""
+        embedded: Tensor = self.embed(candidates * self.scale)
+        return embedded
+
+    def embed_positions(self, graph: KeypointGraph) -> Tensor:
+        """Embed position, prior and spacing of each keypoint. -> (P, width)"""
+        inputs = torch.cat([graph.positions, graph.odds[:, None] / 4, graph.spacing[:, None] - 2], dim=1)
+        embedded: Tensor = self.here(inputs)
+        return embedded
+
+    def rate_alone(self, words: Tensor, state: Tensor) -> Tensor:
+        """Return log P(w | position) / uniform of each candidate. (P, m, width), (P, width) -> (P, m)"""
+        rated: Tensor = self.alone(nnf.silu(words + state[:, None]))
+        return rated[:, :, 0]
 
     def log_ratios(self, words: Tensor, shift: Tensor, neighbours: Tensor) -> Tensor:
         """Return the log-ratio of each candidate of a keypoint with each candidate of each neighbour.
@@ -116,9 +140,31 @@ class ContextModel(nn.Module):
         (P, m, width), (P, k, HIDDEN), (P, k) -> (P, k, m, m)
         """
         count, m, _ = words.shape
-        keys = self.key(words).flatten(1)[neighbours].view(count, neighbours.shape[1], m, -1)  # (P, k, m, rank)
-        queries = self.query(words)[:, None] * self.gate(shift)[:, :, None]  # (P, k, m, rank)
-        return MAX_LOG_RATIO * torch.tanh(queries @ keys.transpose(2, 3) / MAX_LOG_RATIO)
+        keys = self.project(self.key, words)  # (P, m, s, rank)
+        near = keys.flatten(1)[neighbours].view(count, neighbours.shape[1], *keys.shape[1:])  # (P, k, m, s, rank)
+        queries, bias = self.gate_queries(words, shift), self.bias(shift)  # (P, k, m, s, rank), (P, k, s)
+        # Products of single candidates: matrix products of two by two rows are slower.
+        rows = [
+            torch.stack([self.combine(queries[:, :, own], near[:, :, other], bias) for other in range(m)], dim=-1)
+            for own in range(m)
+        ]
+        return torch.stack(rows, dim=-2)
+
+    def project(self, layer: nn.Module, words: Tensor) -> Tensor:
+        """(P, m, width) -> (P, m, s, rank)"""
+        projected: Tensor = layer(words)
+        return projected.unflatten(-1, (self.shape.components, self.shape.rank))
+
+    def gate_queries(self, words: Tensor, shift: Tensor) -> Tensor:
+        """Return q_s(w) ∘ g_s(Δ). (P, m, width), (P, k, HIDDEN) -> (P, k, m, s, rank)"""
+        gates = self.project(self.gate, shift)  # (P, k, s, rank)
+        return self.project(self.query, words)[:, None] * gates[:, :, None]
+
+    def combine(self, queries: Tensor, keys: Tensor, bias: Tensor) -> Tensor:
+        """Return the limited log-ratio of pairs. (..., s, rank), (..., s, rank), (..., s) -> (...)"""
+        parts = (queries * keys).sum(dim=-1) * self.shape.rank**-0.5 + bias
+        ratios = torch.logsumexp(parts, dim=-1) - math.log(self.shape.components)
+        return MAX_LOG_RATIO * torch.tanh(ratios / MAX_LOG_RATIO)
 
 
 class Gather(nn.Module):
@@ -131,9 +177,10 @@ class Gather(nn.Module):
         self.update = nn.Sequential(
             nn.LayerNorm(3 * width), nn.Linear(3 * width, 2 * width), nn.SiLU(), nn.Linear(2 * width, width)
         )
-        self.fits = nn.Linear(width, width)
-        nn.init.zeros_(self.fits.weight)
-        nn.init.zeros_(self.fits.bias)
+        self.fits, self.gain = nn.Linear(width, width), nn.Linear(width, 1)
+        for layer in (self.fits, self.gain):
+            nn.init.zeros_(layer.weight)
+            nn.init.zeros_(layer.bias)
 
     def forward(self, words: Tensor, odds: Tensor, state: Tensor, shift: Tensor, graph: KeypointGraph) -> tuple[Tensor, Tensor]:
         """(P, m, width), (P, m), (P, width), (P, k, HIDDEN) -> (P, m), (P, width)"""
@@ -143,13 +190,14 @@ class Gather(nn.Module):
         gathered = self.mix((kernels @ messages[graph.neighbours]).flatten(1))  # (P, width)
         state = state + self.update(torch.cat([state, gathered, believed], dim=1))
         fit = torch.einsum("pw,pmw->pm", self.fits(state), words) * words.shape[2] ** -0.5
-        return odds + fit, state
+        return odds * (1 + self.gain(state)) + fit, state
 
 
-def propagate(alone: Tensor, ratios: Tensor, trust: Tensor, neighbours: Tensor, rounds: int) -> Tensor:
-    """Return the log odds of each candidate over none after `rounds` of belief propagation.
+def propagate(alone: Tensor, ratios: Tensor, trust: Tensor, neighbours: Tensor, reverse: Tensor, rounds: int) -> Tensor:
+    """Return the log odds of each candidate over none after `rounds` of damped belief propagation.
 
-    With trust 1, one round gives the exact posterior of a keypoint whose neighbours are connected through it alone.
+    With trust 1 on a tree, it converges to the exact posterior. One round is exact for a keypoint whose neighbours are connected
+    through it alone.
 
     Parameters
     ----------
@@ -157,31 +205,42 @@ def propagate(alone: Tensor, ratios: Tensor, trust: Tensor, neighbours: Tensor, 
     ratios : (P, k, m, m) log-ratio of the p-th keypoint's candidate and of its k-th neighbour's
     trust : (P, k) weight of each neighbour's message
     neighbours : (P, k) the indices of the neighbours
+    reverse : (P, k) flat index of the message in the opposite direction; P k if there is none
 
     Returns
     -------
     (P, m)
     """
+    m = alone.shape[1]
     excess = torch.expm1(ratios)
+    messages: Tensor | None = None  # (P, k, m)
     odds = alone
     for _ in range(rounds):
+        sent = odds[neighbours]  # (P, k, m) the neighbours' odds, without the message that they got from this keypoint
+        if messages is not None:
+            received = torch.cat([messages.reshape(-1, m), messages.new_zeros(1, m)])  # the last one stands for no message
+            sent = sent - received[reverse]
         # Σ_s belief(s) ratio(c, s) over the neighbour's m + 1 states, none of them having ratio 1.
-        message = torch.einsum("pkcd,pkd->pkc", excess, compute_probabilities(odds)[neighbours])
-        odds = alone + torch.einsum("pkc,pk->pc", torch.log1p(message.clamp_min(-0.9999)), trust)
+        sums = (excess * compute_probabilities(sent)[:, :, None]).sum(dim=-1)
+        updated = torch.log1p(sums.clamp_min(-0.9999)) * trust[:, :, None]
+        messages = updated if messages is None else DAMPING * messages + (1 - DAMPING) * updated
+        odds = alone + messages.sum(dim=1)
     return odds
 
 
 def compute_probabilities(odds: Tensor) -> Tensor:
-    """Return the probabilities of the candidates, which sum to 1 with that of none. (P, m) -> (P, m)"""
-    return torch.cat([odds, torch.zeros_like(odds[:, :1])], dim=1).softmax(dim=1)[:, :-1]
+    """Return the probabilities of the candidates, which sum to 1 with that of none. (..., m) -> (..., m)"""
+    return torch.cat([odds, torch.zeros_like(odds[..., :1])], dim=-1).softmax(dim=-1)[..., :-1]
 
 
 def encode_offsets(offsets: Tensor) -> Tensor:
-    """Encode displacements as smooth features: direction, and length on a log scale. (..., 2) -> (..., 4 + 4 frequencies)"""
+    """Encode displacements as smooth features: direction, and length on a log scale. (..., 2) -> (..., 4 + 6 frequencies)"""
     length = offsets.norm(dim=-1, keepdim=True)
     direction = offsets / length.clamp_min(0.5)
     x, y = direction.split(1, dim=-1)
+    double = torch.cat([x * x - y * y, x * y], dim=-1)  # of twice the angle
     phase = torch.log1p(length.clamp_max(MAX_DISTANCE)) * (math.pi / math.log1p(MAX_DISTANCE))
     sines = [torch.sin(phase * frequency) for frequency in FREQUENCIES]
     cosines = [torch.cos(phase * frequency) for frequency in FREQUENCIES]
-    return torch.cat([direction, x * x - y * y, x * y, *sines, *cosines, *[direction * sine for sine in sines]], dim=-1)
+    angular = [part * sine for sine in sines for part in (direction, double)]
+    return torch.cat([direction, double, *sines, *cosines, *angular], dim=-1)

@@ -1,6 +1,10 @@
-"""Training of the context model on co-occurrences of words in public photographs.
+"""Training of the context model on co-occurrences of words in public photographs, in two stages.
 
-loss = cross-entropy of the true word among the candidates and "none of them" + 1 − cosine(posterior mean, true descriptor)
+1. Pairs: the log-ratio of two words at a displacement, by noise contrast. The true words of two neighbours are distinguished from
+   a pair with a uniformly random word, and from a pair with the true word of another keypoint. All words are known in this stage.
+2. Releases: cross-entropy of the true word among the candidates and "none of them" + 1 − cosine(posterior mean, true descriptor).
+
+The first stage is necessary: from releases of small ε alone the log-ratios are learned very slowly.
 """
 
 from __future__ import annotations
@@ -20,13 +24,16 @@ from bench.api import Defense
 from bench.codebook.public import Public
 from bench.codebook.true_words import find_true_candidates, find_true_words
 from bench.context.encoding import build_graph, prior_odds
-from bench.context.network import Belief, ContextModel, KeypointGraph, Shape
+from bench.context.network import Belief, ContextModel, KeypointGraph, Shape, encode_offsets
 from bench.core.device import pick_device
 from bench.core.progress import Progress
 from bench.images.views import PhotographView
 from bench.inversion.data import SupportedSettings, draw_crop
+from bench.inversion.optimizer import Optimizer
 from bench.inversion.plan import Training
 from bench.types import Features, WordSets
+
+ANCHORS = 400  # keypoints of an example whose pairs are used in the first stage
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,37 +91,81 @@ def build_sampler(
     return draw
 
 
+def compute_pair_loss(module: ContextModel, example: Example) -> Tensor:
+    """Return the loss of the first stage, on a random part of the keypoints. -> ()
+
+    The example has two candidates for each keypoint: the true word and a random one.
+
+    Logits: log-ratio + rating of the neighbour's word, against a random word; log-ratio, against the word of another keypoint;
+    rating of a word alone, against a random word.
+    """
+    graph, count = example.graph, len(example.labels)
+    rows = torch.arange(count, device=example.labels.device)
+    order = torch.stack([example.labels, 1 - example.labels], dim=1)  # the true word first
+    words = module.embed_words(graph.candidates[rows[:, None], order])  # (P, 2, width)
+    ratings = module.rate_alone(words, module.embed_positions(dataclasses.replace(graph, odds=torch.zeros_like(graph.odds))))
+    anchors = torch.randperm(count, device=rows.device)[:ANCHORS]  # A of the keypoints
+    near, present = graph.neighbours[anchors], graph.present[anchors]  # (A, k)
+    shift = module.shift(encode_offsets(graph.offsets[anchors]))
+    keys = module.project(module.key, words)  # (P, 2, s, rank)
+    others = keys[torch.randperm(count, device=rows.device), :1]  # (P, 1, s, rank) true words, of other keypoints
+    queries, bias = (
+        module.gate_queries(words[anchors, :1], shift),
+        module.bias(shift)[:, :, None],
+    )  # (A, k, 1, s, rank), (A, k, 1, s)
+    ratios = module.combine(queries, torch.cat([keys, others], dim=1)[near], bias)  # (A, k, 3)
+    true, random = (ratios[:, :, :2] + ratings[near]).unbind(dim=2)
+    losses = nnf.softplus(-true) + nnf.softplus(random) + nnf.softplus(-ratios[:, :, 0]) + nnf.softplus(ratios[:, :, 2])
+    alone = nnf.softplus(-ratings[:, 0]) + nnf.softplus(ratings[:, 1])
+    return (losses * present).sum() / present.sum().clamp_min(1) + alone.mean()
+
+
 def compute_loss(module: ContextModel, example: Example) -> Tensor:
-    """Return the loss defined at the top of this file. -> ()"""
+    """Return the loss of the second stage. -> ()"""
     belief = module(example.graph)
     cosine = (belief.mean(example.graph.candidates) * example.descriptors).sum(dim=1).mean()
     return nnf.cross_entropy(belief.logits, example.labels) + 1 - cosine
 
 
-def fit(shape: Shape, draw: Callable[[np.random.Generator], Example], training: Training) -> ContextModel:
-    """Train from random weights, with examples of the seeds (seed, step), and return the network of averaged weights."""
+@dataclass(frozen=True, kw_only=True)
+class Stage:
+    """A stage of the training: its examples, its loss and its number of steps."""
+
+    draw: Callable[[np.random.Generator], Example]
+    loss: Callable[[ContextModel, Example], Tensor]
+    steps: int
+
+
+def fit(shape: Shape, stages: Sequence[Stage], training: Training) -> ContextModel:
+    """Train from random weights in stages, and return the network of averaged weights.
+
+    The examples have the seeds (seed, stage, step). In each stage the rate rises to `training.rate`, then falls to zero by a
+    cosine.
+    """
     torch.manual_seed(training.seed)
     device = pick_device()
     module = ContextModel(shape).to(device)
     average = {name: value.clone() for name, value in module.state_dict().items()}
-    optimizer = torch.optim.AdamW(module.parameters(), training.rate, weight_decay=training.decay)
-    started, smooth = time.monotonic(), math.nan
-    with Progress("training", training.steps) as progress:
-        for step in range(training.steps):
-            factor = min((step + 1) / training.warmup, 0.5 * (1 + math.cos(math.pi * step / training.steps)))
-            for group in optimizer.param_groups:
-                group["lr"] = training.rate * factor
-            value = compute_loss(module, draw(np.random.default_rng([training.seed, step])).to(device))
-            optimizer.zero_grad(set_to_none=True)
-            value.backward()
-            torch.nn.utils.clip_grad_norm_(module.parameters(), 1.0)
-            optimizer.step()
-            decay = min(training.average, (step + 1) / (step + 10))  # small at first, while the weights change fast
-            for name, weight in module.state_dict().items():
-                average[name].lerp_(weight, 1 - decay)
-            smooth = float(value.detach()) if math.isnan(smooth) else 0.98 * smooth + 0.02 * float(value.detach())
-            speed = (step + 1) * training.batch / (time.monotonic() - started)
-            progress.advance(1, f"loss {smooth:.4f}, {speed:.1f} images/s")
+    optimizer = Optimizer(module, training.rate, training.decay)
+    started, smooth, done = time.monotonic(), math.nan, 0
+    with Progress("training", sum(stage.steps for stage in stages)) as progress:
+        for number, stage in enumerate(stages):
+            for step in range(stage.steps):
+                optimizer.rate = training.rate * min(
+                    (step + 1) / training.warmup, 0.5 * (1 + math.cos(math.pi * step / stage.steps))
+                )
+                value = stage.loss(module, stage.draw(np.random.default_rng([training.seed, number, step])).to(device))
+                module.zero_grad()
+                value.backward()
+                torch.nn.utils.clip_grad_norm_(module.parameters(), 1.0)
+                optimizer.step()
+                done += 1
+                decay = min(training.average, done / (done + 9))  # small at first, while the weights change fast
+                for name, weight in module.state_dict().items():
+                    average[name].lerp_(weight, 1 - decay)
+                smooth = float(value.detach()) if step == 0 else 0.98 * smooth + 0.02 * float(value.detach())
+                speed = done * training.batch / (time.monotonic() - started)
+                progress.advance(1, f"stage {number + 1}, loss {smooth:.4f}, {speed:.1f} images/s")
     module.load_state_dict(average)
     return module.eval()
 

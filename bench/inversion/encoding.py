@@ -45,8 +45,9 @@ class EncodedRelease:
 
 
 # Network input for a keypoint. "released": the unchanged release, stacked as in the paper (m words in order, or a random origin
-# and basis). "invariant": the release without its random order or basis. "positions": the position alone.
-Encoding = Literal["invariant", "released", "positions"]
+# and basis). "invariant": the release without its random order or basis. "positions": the position alone. "posteriors": as
+# "released", and `bench.context.reconstruct` appends the posterior of each word.
+Encoding = Literal["invariant", "released", "positions", "posteriors"]
 
 
 def stack(release: Release, encoding: Encoding) -> Floats:

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from bench.inversion.encoding import CELL, EncodedRelease
 
+MIN_LOG_POSTERIOR = -12.0  # smaller ones are the same to the network
 COARSENET = (256, 256, 256, 512, 512, 512)  # its encoder's channels (Pittaluga et al., CVPR 2019)
 
 
@@ -28,6 +29,7 @@ class Shape:
     inputs: int  # numbers per keypoint
     candidates: int = 0  # candidates that are embedded one by one and summed; 0: all numbers are embedded together
     length: int = 0  # of one candidate
+    posteriors: bool = False  # each candidate is weighted by its posterior (`bench.context.reconstruct`)
     hidden: int = 256  # width of the embedding MLP
     widths: tuple[int, ...] = (32, 64, 112, 112)  # channels at 1/4, 1/8, ... of the image's side
     last: int = 32  # channels at 1/2
@@ -42,12 +44,16 @@ class Inverter(nn.Module):
         super().__init__()
         first = shape.widths[0]
         self.shape = shape
+        common = shape.inputs - max(0, shape.candidates - 1) * shape.length
         self.embed = nn.Sequential(
-            nn.Linear(shape.inputs - max(0, shape.candidates - 1) * shape.length, shape.hidden),
+            nn.Linear(shape.length + 2 if shape.posteriors else common, shape.hidden),
             nn.SiLU(inplace=True),
             nn.Linear(shape.hidden, shape.hidden),
             nn.SiLU(inplace=True),
         )
+        if shape.posteriors:
+            self.weigh = nn.Sequential(nn.Linear(4, 16), nn.SiLU(), nn.Linear(16, 1))
+            self.alone = nn.Sequential(nn.Linear(5, 64), nn.SiLU(), nn.Linear(64, shape.hidden))
         self.own = nn.Linear(shape.hidden, first - 1)
         self.around = nn.Linear(shape.hidden, shape.patch**2 * shape.painted)
         self.stem = conv_norm(first + shape.painted, first)
@@ -95,6 +101,8 @@ class Inverter(nn.Module):
 
     def embed_points(self, points: EncodedRelease) -> Tensor:
         """Embed each keypoint. -> (P, hidden)"""
+        if self.shape.posteriors:
+            return self.embed_with_posteriors(points.values)
         return self.embed_set(points.values) if self.shape.candidates else self.embed(points.values)
 
     def embed_set(self, values: Tensor) -> Tensor:
@@ -105,6 +113,25 @@ class Inverter(nn.Module):
         hidden = self.embed(torch.cat([candidates, common], dim=2))  # (P, m, hidden)
         present = candidates.any(dim=2)[..., None]  # not padding
         return (hidden * present).sum(dim=1) / present.sum(dim=1).clamp(min=1).sqrt()
+
+    def embed_with_posteriors(self, values: Tensor) -> Tensor:
+        """Embed each candidate, and sum the embeddings weighted by posteriors. (P, F) -> (P, hidden)
+
+        A row holds m candidates, the position in the cell, the log posteriors of each candidate and of none of them, and two
+        numbers for the defense: the prior log odds of a candidate and m, both divided by 4. The weight of a candidate is its
+        posterior times a learned function of the posterior and of the defense, from e^-3 to e^3.
+        """
+        length = self.shape.length
+        count = (values.shape[1] - 5) // (length + 1)  # m
+        candidates = values[:, : count * length].view(-1, count, length)
+        within, logs, none, defense = values[:, count * length :].split((2, count, 1, 2), dim=1)
+        posteriors = logs.exp()
+        limited = logs.clamp(min=MIN_LOG_POSTERIOR) / 4
+        evidence = torch.stack([limited, posteriors, *(part.expand(-1, count) for part in defense.split(1, dim=1))], dim=2)
+        weights = posteriors * self.weigh(evidence)[:, :, 0].float().clamp(-3, 3).exp()
+        hidden = self.embed(torch.cat([candidates, within[:, None].expand(-1, count, -1)], dim=2))  # (P, m, hidden)
+        summed = (hidden * weights[:, :, None]).sum(dim=1)
+        return summed + self.alone(torch.cat([within, defense, none.clamp(min=MIN_LOG_POSTERIOR) / 4], dim=1))
 
 
 def conv_norm(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:

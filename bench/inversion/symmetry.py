@@ -10,7 +10,7 @@ import dataclasses
 import math
 from dataclasses import dataclass
 from functools import singledispatch
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar, cast
 
 import numpy as np
 
@@ -19,6 +19,9 @@ from bench.types import Bytes, Descriptors, Floats, Indices, Points, Release, Su
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+
+AnyRelease = TypeVar("AnyRelease", bound=Release)
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +41,7 @@ class Symmetry:
         back = image.rot90(-self.turns, (1, 2))
         return back.flip(2) if self.mirrored else back
 
-    def transform_release(self, release: Release) -> Release:
+    def transform_release(self, release: AnyRelease) -> AnyRelease:
         """Return the release of the transformed photograph.
 
         Raises
@@ -47,7 +50,7 @@ class Symmetry:
             if there is a permutation and releases of this type have none.
         """
         if self.order is not None:
-            release = _permute(release, self.order, self)
+            release = cast(AnyRelease, _permute(release, self.order, self))
         (width, height), (x, y) = release.size, release.keypoints.T
         if self.mirrored:
             x = width - x

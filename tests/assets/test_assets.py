@@ -7,6 +7,7 @@ import pytest
 import bench
 from attacks.dia import DIA
 from bench.codebook.public import ASSETS, Public
+from bench.context import weights as context
 from bench.extractors.sift import Sift
 from bench.images import photographs
 from bench.inversion import weights
@@ -19,7 +20,8 @@ from defenses.none import Undefended
 from metrics.ssim import SSIM
 
 ORIENTED = ASSETS / "inversion-oriented.safetensors"  # for other features; not compared here
-NETWORKS = sorted(set(ASSETS.glob("inversion-*.safetensors")) - {ORIENTED})
+WORDS = ASSETS / "inversion-ldp.safetensors"  # trained longer than the others, with a context model
+NETWORKS = sorted(set(ASSETS.glob("inversion-*.safetensors")) - {ORIENTED, WORDS})
 
 THIRD = 266  # photographs that the dictionary was not built from
 
@@ -68,6 +70,17 @@ def test_networks_have_equal_training_and_follow_the_rules(path):
     assert meta["photographs"] == THIRD
     if meta["quantisation_error"] is not None:
         check_quantisation(meta["quantisation_error"]["training"], meta["quantisation_error"]["validation"])
+
+
+def test_the_network_for_words_is_trained_longer_and_follows_the_rules():
+    """It starts from the network for raw descriptors. The defense that it attacks cannot gain from a weaker attacker."""
+    network, start = weights.load(WORDS), weights.load(ASSETS / "inversion-none.safetensors")
+    stages = weights.list_training_stages(network.meta)
+    assert (stages[:-1], stages[-1]["start"]) == (weights.list_training_stages(start.meta), start.digest)
+    own = [stage for stage in weights.list_training_stages(weights.load(NETWORKS[0]).meta) if stage["photographs"] == THIRD]
+    assert stages[-1]["crops"] > sum(stage["crops"] for stage in own)
+    assert network.meta["context"] == context.load(ASSETS / "context.safetensors").digest
+    check_quantisation(**network.meta["quantisation_error"])
 
 
 def test_every_required_release_is_supported(public):
