@@ -1,7 +1,7 @@
 # Two commands on a fresh machine with Python 3.11 or newer: `make demo` and `make test`. Each sets up what it needs.
 PYTHON ?= python3
 BIN := .venv/bin
-DEMO ?= --defense none --defense affine --defense ldp:epsilon=16 --defense ldp --attack dia --attack keypoints --attack blank
+DEMO ?= --defense none --defense affine --defense ldp:epsilon=16 --defense ldp --attack dia --attack keypoints --attack blank --attack oracle
 DATA ?= ../shared/data
 
 SMOKE := --defense none --defense affine --defense ldp:epsilon=16 --attack dia

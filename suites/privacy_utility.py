@@ -4,6 +4,7 @@ from attacks.blank import Blank
 from attacks.dia import DIA
 from attacks.keypoints import Keypoints
 from attacks.lattice import Lattice
+from attacks.oracle import Oracle
 from bench.datasets.gallery import Gallery
 from bench.runner.suite import Suite, grid
 from bench.settings import Asset
@@ -26,7 +27,7 @@ SUITE = Suite(
             *(LDP(epsilon=epsilon, dictionary=Asset("shipped")) for epsilon in EPSILONS),
             *(LDP(epsilon=10, subset_size=size, dictionary=Asset("shipped")) for size in SIZES if size != LDP.subset_size),
         ],
-        attacks=[DIA(), Lattice(), Blank(), Keypoints()],
+        attacks=[DIA(), Oracle(), Lattice(), Blank(), Keypoints()],
         tasks=[Reconstruction(), Localization()],
         datasets=[Gallery(queries=50, night=0.0)],
     ),

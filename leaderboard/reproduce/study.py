@@ -120,6 +120,12 @@ def build_row_as_printed(row: Row, network: Asset) -> Row:
     )
 
 
+def build_oracle_row(row: Row) -> Row:
+    """Return the row of the same release, reconstructed by a reference that knows the true words, without the paper's values."""
+    oracle: Attack = build_plugin(discovery.ATTACK, "oracle", {})
+    return replace(row, name=f"{row.name}, oracle", labels={**row.labels, "attack": oracle.name()}, paper={}, attack=oracle)
+
+
 def build_baseline_rows(task: Task) -> tuple[Row, ...]:
     """Return the rows of the baselines of a table of reconstructions, on features without a defense.
 

@@ -17,6 +17,7 @@ from PIL import Image
 from scipy.stats import binomtest
 
 from attacks.dia import DIA
+from attacks.oracle import Oracle
 from bench import cli
 from bench.api import Attack, Defense
 from bench.cache import store
@@ -179,6 +180,17 @@ def test_rows_as_printed_stand_beside_ours(tmp_path: Path) -> None:
             assert (row.defense, row.task, row.paper) == (ours.defense, ours.task, {})
             assert (ours.labels["attack"], row.attack) == ("dia", DIA(weights=network))
             assert row.attack != ours.attack
+
+
+@pytest.mark.slow
+def test_an_oracle_stands_beside_each_row_of_word_sets() -> None:
+    setting = Setting(profile=CPU, materials=Materials(), extractor=Sift(), photographs=7)
+    by_name = {row.name: row for row in tables.load_tables()["table4"].build_rows(setting)}
+    oracles = {name.removesuffix(", oracle"): row for name, row in by_name.items() if isinstance(row.attack, Oracle)}
+    assert len(oracles) == 16
+    for name, row in oracles.items():
+        assert (row.defense, row.task, row.paper) == (by_name[name].defense, by_name[name].task, {})
+        assert (by_name[name].labels["attack"], row.labels["attack"]) == ("dia", "oracle")
 
 
 def test_a_network_with_another_input_is_no_network_as_printed(

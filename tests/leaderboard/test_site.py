@@ -1,6 +1,7 @@
 """The page in a real browser: use by mouse, by keyboard and on a phone."""
 
 import re
+import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -559,10 +560,15 @@ def test_names_of_records_lead_to_no_other_files(tmp_path: Path) -> None:
     (record,) = reconstructions(NONE, [0.5])
     record["sample"] = "../../../secret"
     folder = fabricated.write(tmp_path / "runs", [record])
-    (folder / "reconstructions" / record["experiment_id"]).mkdir(parents=True)
-    assert reconstruction_path(folder, record).resolve() == secret
+    picture = reconstruction_path(folder, record)
+    assert folder in picture.resolve().parents
+    picture.parent.mkdir(parents=True)
+    picture.symlink_to(secret)
     written = site.write([folder], tmp_path / "site").page
     assert not (written.parent / "pictures").exists()
+    picture.unlink()
+    shutil.copy(secret, picture)  # the control: a picture that lies there
+    assert (site.write([folder], tmp_path / "site").page.parent / "pictures").exists()
     assert record["experiment_id"] == experiment_id({"name": "reconstruction"}, NONE, DIA, PHOTOGRAPHS, 0, SETTINGS)
 
 
