@@ -48,7 +48,7 @@ def test_results_are_those_of_the_demo(tmp_path: Path) -> None:
     reported = read_table((tmp_path / "run" / "report.md").read_text(encoding="utf-8"))
     printed = read_table(README[README.index("## Results") :])
     assert list_differences(printed, reported) == []
-    assert len(printed) == 6
+    assert len(printed) == 7
 
 
 def test_other_results_are_found() -> None:
