@@ -101,7 +101,7 @@ def _load_context(network: Network) -> context.Network:
         if the installed one is another.
     """
     installed = context.load(ASSETS / "context.safetensors")
-    if installed.digest != network.meta["context"]:
+    if installed.digest != network.meta.get("context"):
         raise UserError(f"dia: {network.path} was trained with another context model than {installed.path}; reinstall")
     return installed
 

@@ -90,8 +90,10 @@ def test_a_candidate_of_posterior_zero_has_no_effect(pixels, network):
     assert np.abs(reconstruct(release, half) - reconstruct(other, half)).max() > 0.05
 
 
-def test_another_context_model_is_refused_before_anything_is_written(network, monkeypatch, tmp_path):
-    changed = dataclasses.replace(network, meta=network.meta | {"context": "sha256:00"})
+@pytest.mark.parametrize("meta", [{"context": "sha256:00"}, {}], ids=["another", "none"])
+def test_another_context_model_is_refused_before_anything_is_written(network, monkeypatch, meta):
+    named = {key: value for key, value in network.meta.items() if key != "context"}
+    changed = dataclasses.replace(network, meta=named | meta)
     monkeypatch.setattr(dia, "load", lambda path: changed)
     with pytest.raises(UserError, match="another context model"):
         DIA().assets(LDP(), Sift(), Public())
