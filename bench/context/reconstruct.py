@@ -15,7 +15,7 @@ from bench.context.encoding import build_graph
 from bench.context.network import ContextModel
 from bench.inversion.encoding import EncodedRelease, encode
 from bench.inversion.network import Inverter
-from bench.inversion.reconstruct import infer
+from bench.inversion.reconstruct import average_reconstructions
 from bench.inversion.symmetry import Symmetry
 from bench.types import Floats, WordSets
 
@@ -23,18 +23,17 @@ from bench.types import Floats, WordSets
 def reconstruct_from_posteriors(
     inverter: Inverter, context: ContextModel, release: WordSets, odds: float, symmetries: Sequence[Symmetry]
 ) -> Floats:
-    """Return the mean of the reconstructions from all symmetries of the release, each transformed back. -> (H, W, 3) in [0, 1]
+    """Return the mean reconstruction of a release. -> (H, W, 3) in [0, 1]
 
     Parameters
     ----------
     odds : prior log odds of a candidate over none (`bench.context.encoding.prior_odds`)
     """
-    images = []
-    for symmetry in symmetries:
-        transformed = symmetry.transform_release(release)
-        logs = compute_log_posteriors(context, transformed, odds)
-        images.append(symmetry.invert_image(infer(inverter, encode_posteriors(transformed, logs, odds))[0]))
-    return torch.stack(images).mean(dim=0).permute(1, 2, 0).cpu().numpy()
+
+    def encode_one(transformed: WordSets) -> EncodedRelease:
+        return encode_posteriors(transformed, compute_log_posteriors(context, transformed, odds), odds)
+
+    return average_reconstructions(inverter, release, symmetries, encode_one)
 
 
 @torch.inference_mode()

@@ -2,19 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor, nn
 
 from bench.core.device import pick_dtype
 from bench.inversion.encoding import EncodedRelease, Encoding, encode
-from bench.inversion.symmetry import Symmetry
+from bench.inversion.symmetry import AnyRelease, Symmetry
 from bench.types import Floats, Release
 
 
 def reconstruct_image(
     module: nn.Module, release: Release, symmetries: Sequence[Symmetry], settings: Floats, slots: int, encoding: Encoding
+) -> Floats:
+    """Return the mean reconstruction of a release. -> (H, W, 3) in [0, 1]"""
+    return average_reconstructions(
+        module, release, symmetries, lambda transformed: encode([transformed], [settings], slots, encoding)
+    )
+
+
+def average_reconstructions(
+    module: nn.Module,
+    release: AnyRelease,
+    symmetries: Sequence[Symmetry],
+    encode_one: Callable[[AnyRelease], EncodedRelease],
 ) -> Floats:
     """Return the mean of the reconstructions from all symmetries of the release, each transformed back. -> (H, W, 3) in [0, 1]
 
@@ -22,7 +34,7 @@ def reconstruct_image(
     """
     images = []
     for symmetry in symmetries:
-        encoded = encode([symmetry.transform_release(release)], [settings], slots, encoding)
+        encoded = encode_one(symmetry.transform_release(release))
         images.append(symmetry.invert_image(infer(module, encoded)[0]))
     return torch.stack(images).mean(dim=0).permute(1, 2, 0).cpu().numpy()
 
