@@ -6,13 +6,16 @@ are chosen by the recall of raw descriptors alone (`tools/tune_night.py`), on a 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 from bench.api import Dataset
 from bench.core.errors import UserError
 from bench.datasets.gallery import Gallery
 from bench.images.scene import Scene
 from bench.rendering.rooms import ROOMS
+
+BY_NIGHT = ("viewpoint", "blur", "noise")  # fields of `HardNight` that differ by night
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,26 +42,22 @@ class HardNight(Dataset):
 
     def by_day(self) -> Gallery:
         """Return the gallery of the references and of the queries by day."""
-        return Gallery(
-            seed=self.seed,
-            views=self.views,
-            queries=self.queries,
-            night=self.night,
-            width=self.width,
-            height=self.height,
-            rooms=self.rooms,
-            detail=self.detail,
-        )
+        return Gallery(**select_shared(self))
 
     def by_night(self) -> Gallery:
         """Return the gallery of the queries by night."""
-        return replace(self.by_day(), viewpoint=self.viewpoint, blur=self.blur, noise=self.noise)
+        return replace(self.by_day(), **{name: getattr(self, name) for name in BY_NIGHT})
 
     def scene(self) -> Scene:
         day = self.by_day().scene()
         pairs = zip(day.queries, self.by_night().scene().queries, strict=True)
         queries = tuple(hard if query.condition == "night" else query for query, hard in pairs)
         return replace(day, name="hard-night", queries=queries)
+
+
+def select_shared(dataset: Gallery | HardNight) -> dict[str, Any]:
+    """Return the values of the fields of `HardNight` that are equal by day and by night."""
+    return {field.name: getattr(dataset, field.name) for field in fields(HardNight) if field.name not in BY_NIGHT}
 
 
 PLUGIN = HardNight

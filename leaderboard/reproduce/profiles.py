@@ -11,7 +11,7 @@ from typing import get_args
 from bench.api import Extractor
 from bench.core.errors import unknown_name
 from bench.datasets.gallery import Gallery
-from bench.datasets.hard_night import HardNight
+from bench.datasets.hard_night import HardNight, select_shared
 from bench.datasets.walk import Walk
 from bench.settings import Asset
 from bench.sfm.incremental_mapping import Mapper
@@ -44,17 +44,7 @@ class Profile:
     @property
     def hard_night(self) -> HardNight:
         """The default dataset of the localization tables: the gallery with a night that is hard to localize."""
-        gallery = self.gallery
-        return HardNight(
-            seed=gallery.seed,
-            views=gallery.views,
-            queries=gallery.queries,
-            night=gallery.night,
-            width=gallery.width,
-            height=gallery.height,
-            rooms=gallery.rooms,
-            detail=gallery.detail,
-        )
+        return HardNight(**select_shared(self.gallery))
 
     @property
     def figure_gallery(self) -> Gallery:
