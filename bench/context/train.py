@@ -91,8 +91,8 @@ def build_sampler(
     return draw
 
 
-def compute_pair_loss(module: ContextModel, example: Example) -> Tensor:
-    """Return the loss of the first stage, on a random part of the keypoints. -> ()
+def compute_pair_loss(module: ContextModel, example: Example, anchors: int = ANCHORS) -> Tensor:
+    """Return the loss of the first stage, on the pairs of `anchors` random keypoints. -> ()
 
     The example has two candidates for each keypoint: the true word and a random one.
 
@@ -104,13 +104,13 @@ def compute_pair_loss(module: ContextModel, example: Example) -> Tensor:
     order = torch.stack([example.labels, 1 - example.labels], dim=1)  # the true word first
     words = module.embed_words(graph.candidates[rows[:, None], order])  # (P, 2, width)
     ratings = module.rate_alone(words, module.embed_positions(dataclasses.replace(graph, odds=torch.zeros_like(graph.odds))))
-    anchors = torch.randperm(count, device=rows.device)[:ANCHORS]  # A of the keypoints
-    near, present = graph.neighbours[anchors], graph.present[anchors]  # (A, k)
-    shift = module.shift(encode_offsets(graph.offsets[anchors]))
+    chosen = torch.randperm(count, device=rows.device)[:anchors]  # (A,)
+    near, present = graph.neighbours[chosen], graph.present[chosen]  # (A, k)
+    shift = module.shift(encode_offsets(graph.offsets[chosen]))
     keys = module.project(module.key, words)  # (P, 2, s, rank)
     others = keys[torch.randperm(count, device=rows.device), :1]  # (P, 1, s, rank) true words, of other keypoints
     queries, bias = (
-        module.gate_queries(words[anchors, :1], shift),
+        module.gate_queries(words[chosen, :1], shift),
         module.bias(shift)[:, :, None],
     )  # (A, k, 1, s, rank), (A, k, 1, s)
     ratios = module.combine(queries, torch.cat([keys, others], dim=1)[near], bias)  # (A, k, 3)
@@ -120,11 +120,11 @@ def compute_pair_loss(module: ContextModel, example: Example) -> Tensor:
     return (losses * present).sum() / present.sum().clamp_min(1) + alone.mean()
 
 
-def compute_loss(module: ContextModel, example: Example) -> Tensor:
-    """Return the loss of the second stage. -> ()"""
+def compute_loss(module: ContextModel, example: Example, weight: float = 1.0) -> Tensor:
+    """Return the loss of the second stage, with a weight of the term of the cosine. -> ()"""
     belief = module(example.graph)
     cosine = (belief.mean(example.graph.candidates) * example.descriptors).sum(dim=1).mean()
-    return nnf.cross_entropy(belief.logits, example.labels) + 1 - cosine
+    return nnf.cross_entropy(belief.logits, example.labels) + weight * (1 - cosine)
 
 
 @dataclass(frozen=True, kw_only=True)
