@@ -77,6 +77,7 @@ from defenses.ldp import LDP
 CONTEXT_SHAPE = ContextShape(width=128, hidden=512, rank=40, neighbours=24, kernels=8)
 SIZES = (1, 2, 3, 4)  # m
 SEED = 0
+PAIR_BATCH, BATCH = 24, 32  # crops; releases have a half or a quarter of the first
 RATE = 3e-3  # at the peak; half of it for releases
 DECAY = 0.01  # of the weights
 WARMUP = 200  # steps
@@ -268,14 +269,14 @@ def train_context(
     torch.manual_seed(SEED)
     module = ContextModel(CONTEXT_SHAPE).to(data.views.codes.device)
     nn.init.normal_(module.query.weight, std=0.02)  # not zero, so that the keys learn from the first step on
-    neighbours, batch = CONTEXT_SHAPE.neighbours, 24
+    neighbours = CONTEXT_SHAPE.neighbours
     inputs = digest_inputs(meta)
 
     def pairs(module: ContextModel, rng: np.random.Generator) -> Tensor:
-        return compute_pair_loss(module, draw_pairs(data, batch, neighbours, rng).example, ANCHORS)
+        return compute_pair_loss(module, draw_pairs(data, PAIR_BATCH, neighbours, rng).example, ANCHORS)
 
     def releases(module: ContextModel, rng: np.random.Generator) -> Tensor:
-        drawn = draw_releases(data, lambda size: batch // (2 if size < 3 else 4), neighbours, rng)
+        drawn = draw_releases(data, lambda size: PAIR_BATCH // (2 if size < 3 else 4), neighbours, rng)
         return compute_loss(module, drawn.example, weight=0.3)
 
     secrets, public = [view.features for view in unseen], Public(cache_size=len(unseen))
@@ -292,8 +293,8 @@ def train_context(
     described = {
         **weights.describe(LDP(), dict(LDP.supported_settings), Sift(), Public()),
         **meta,
-        "crops": batch * pair_steps + batch * 7 // 16 * steps,  # of releases: 12 or 6, 10.5 on average
-        "batch": batch,
+        "crops": round(PAIR_BATCH * (pair_steps + 7 / 16 * steps)),  # of releases: a half for 3/4 of the steps, else a quarter
+        "batch": PAIR_BATCH,
         "rate": RATE,
         "seed": SEED,
         "validation": rows,
@@ -329,13 +330,13 @@ def train_inverter(
     """Train the inversion network on candidates with posteriors and write it to `path`, unless that exists; return the path."""
     if path.is_file():
         return path
-    device, batch = data.views.codes.device, 32
+    device = data.views.codes.device
     dtype = pick_dtype(device)
     torch.manual_seed(SEED)
     module: Inverter = build_inverter(initial.module).to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def reconstructions(module: Inverter, rng: np.random.Generator) -> Tensor:
-        drawn = draw_releases(data, lambda size: batch, context.module.shape.neighbours, rng)
+        drawn = draw_releases(data, lambda size: BATCH, context.module.shape.neighbours, rng)
         with torch.no_grad():
             logs = context.module(drawn.example.graph).logits.log_softmax(dim=1)
         with torch.autocast(device.type, dtype, enabled=dtype != torch.float32):
@@ -360,8 +361,8 @@ def train_inverter(
         "slots": module.shape.candidates,
         "start": initial.digest,
         "earlier": weights.list_training_stages(initial.meta),
-        "crops": batch * steps,
-        "batch": batch,
+        "crops": BATCH * steps,
+        "batch": BATCH,
         "optimizer": "muon",
         "symmetries": 8,
         "rate": RATE,

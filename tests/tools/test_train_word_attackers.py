@@ -14,12 +14,15 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter
 from torch import Tensor, nn
 
+from attacks import dia
+from bench.api import View
 from bench.codebook import build
 from bench.codebook.public import ASSETS, Public
 from bench.context import encoding
+from bench.context import weights as context_weights
 from bench.context.network import ContextModel, KeypointGraph, Shape
 from bench.context.reconstruct import encode_posteriors
-from bench.context.train import compute_loss
+from bench.context.train import compute_loss, compute_pair_loss
 from bench.core.errors import UserError
 from bench.extractors.sift import Sift
 from bench.geometry.nearest_words import unit_rows
@@ -30,7 +33,9 @@ from bench.inversion import weights
 from bench.inversion.data import assign_dictionaries
 from bench.inversion.train import check_quantisation
 from bench.settings import Asset
+from bench.threat_model import PublicAssets
 from bench.types import Points, WordSets
+from defenses.ldp import LDP
 
 pytestmark = pytest.mark.slow
 
@@ -223,7 +228,9 @@ def build_stage(stacked: data.TrainingData, steps: int, stop: int | None = None)
     def loss(module: ContextModel, rng: np.random.Generator) -> Tensor:
         if next(calls) == stop:
             raise KeyboardInterrupt
-        return compute_loss(module, trainer.draw_releases(stacked, lambda size: 1, 4, rng).example, weight=0.3)
+        releases = trainer.draw_releases(stacked, lambda size: 1, 4, rng)
+        pairs = trainer.draw_pairs(stacked, 1, 4, rng)
+        return compute_loss(module, releases.example) + compute_pair_loss(module, pairs.example, anchors=20)
 
     return trainer.Stage(name="tiny", number=1, steps=steps, rate=3e-3, average=0.9, loss=loss)
 
@@ -265,6 +272,33 @@ def test_a_resumed_training_gives_the_weights_of_an_uninterrupted_one(stacked: d
 def same_weights(one: nn.Module, other: nn.Module) -> bool:
     values = other.state_dict()
     return all(torch.equal(value, values[name]) for name, value in one.state_dict().items())
+
+
+def test_both_networks_are_trained_and_the_attack_loads_them(
+    world: World, stacked: data.TrainingData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A few steps of tiny batches, then `dia` with the two files in place of the shipped ones."""
+    monkeypatch.setattr(trainer, "CONTEXT_SHAPE", Shape(width=8, hidden=8, rank=4, neighbours=4, layers=1, kernels=2))
+    monkeypatch.setattr(trainer, "PAIR_BATCH", 4)
+    monkeypatch.setattr(trainer, "BATCH", 2)
+    monkeypatch.setattr(trainer, "VALIDATED", trainer.VALIDATED[:1])
+    monkeypatch.setattr(trainer, "RECONSTRUCTED", trainer.RECONSTRUCTED[:1])
+    meta = {"photographs": sorted(world.thirds), "quantisation_error": {"training": 0.5, "validation": 0.5}}
+    initial = weights.load(ASSETS / "inversion-none.safetensors")
+    context = trainer.train_context(tmp_path / "context.safetensors", stacked, world.unseen, meta, 2, 2)
+    path = trainer.train_inverter(tmp_path / "inversion-ldp.safetensors", stacked, world.unseen, meta, 1, context, initial)
+    found, shipped = weights.load(path).meta, weights.load(ASSETS / path.name).meta
+    assert found.keys() - {"validation"} == shipped.keys()
+    different = {"batch", "crops", "context", "photographs", "quantisation_error"}
+    assert {key: found[key] for key in shipped.keys() - different} == {key: shipped[key] for key in shipped.keys() - different}
+    assert context.meta.keys() == context_weights.load(ASSETS / "context.safetensors").meta.keys()
+    monkeypatch.setattr(dia, "ASSETS", tmp_path)
+    public = Public()
+    assert dia.DIA().explain_not_applicable(LDP(), Sift(), public) is None
+    release = LDP().protect(world.unseen[0].features, public, np.random.default_rng(0))
+    knowledge = {PublicAssets: lambda: PublicAssets(assets=public)}
+    view = View(release=release, defense=LDP(), extractor=Sift(), knowledge=knowledge)
+    assert dia.DIA().reconstruct(view, np.random.default_rng(0)).shape == (256, 256, 3)
 
 
 def test_the_schedule_rises_stays_and_falls_to_zero() -> None:
