@@ -1,6 +1,7 @@
 """Training data of the attackers of word sets against the code that attacks, and the resumption of their training."""
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -16,7 +17,7 @@ from torch import Tensor, nn
 
 from attacks import dia
 from bench.api import View
-from bench.codebook import build
+from bench.codebook import build, dictionary
 from bench.codebook.public import ASSETS, Public
 from bench.context import encoding
 from bench.context import weights as context_weights
@@ -50,6 +51,7 @@ NEIGHBOURS = 6
 class World:
     """Six photographs in three thirds, and three dictionaries, each built from two of the thirds."""
 
+    sources: list[Source]
     views: list[PhotographView]
     thirds: dict[str, str]  # photograph -> digit of its third
     dictionaries: dict[str, Asset]  # digits of the thirds -> dictionary
@@ -85,7 +87,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> World:
     thirds = {source.content_hash(): str(int(source.path.stem) % 3) for source in sources}
     unrelated = assign_dictionaries(set(thirds), list(dictionaries.values()), Public())
     unseen = data.collect_training_views([Source("6", folder / "unseen" / "6.png")], (256,))
-    return World(views, thirds, dictionaries, unseen, unrelated)
+    return World(sources, views, thirds, dictionaries, unseen, unrelated)
 
 
 @pytest.fixture(scope="module")
@@ -203,6 +205,32 @@ def test_no_photograph_is_quantised_by_a_dictionary_built_from_it(world: World, 
     for error in data.measure_errors(leaking.views, leaking.words[0]):
         with pytest.raises(UserError, match="quantisation error"):
             check_quantisation(error, validation)
+
+
+def test_training_data_are_stored_and_a_leaking_dictionary_is_refused(
+    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Control: the names of two dictionaries' photographs are exchanged, so that each is assigned to its own photographs."""
+    monkeypatch.setattr(trainer, "LDP", functools.partial(LDP, dictionary=world.dictionaries["01"]))
+    crossfit = [world.dictionaries["12"], world.dictionaries["02"]]
+    path = tmp_path / "data.pt"
+    built, meta = trainer.load_data(path, world.sources, world.unseen, crossfit, CPU)
+    monkeypatch.setattr(trainer, "collect_training_views", None)  # not called again
+    loaded, same = trainer.load_data(path, world.sources, world.unseen, crossfit, CPU)
+    assert meta == same
+    assert meta["photographs"] == sorted(world.thirds)
+    assert len(loaded.views.pixels) == 4 * len(world.sources)
+    for one, other in zip(built.words, loaded.words, strict=True):
+        assert torch.equal(one.nearest, other.nearest)
+        assert torch.equal(one.table, other.table)
+    monkeypatch.setattr(trainer, "collect_training_views", lambda sources: world.views)
+    lying = []
+    for digits, other in (("12", "02"), ("02", "12")):
+        words, claimed = dictionary.load(Path(world.dictionaries[digits])).words, dictionary.load(Path(world.dictionaries[other]))
+        lying.append(Asset(tmp_path / f"{digits}.safetensors"))
+        dictionary.save(Path(lying[-1]), words, claimed.meta)
+    with pytest.raises(UserError, match="quantisation error"):
+        trainer.load_data(tmp_path / "other.pt", world.sources, world.unseen, lying, CPU)
 
 
 def test_smaller_dictionaries_are_the_first_half_and_clustered_words(world: World, stacked: data.TrainingData) -> None:
