@@ -1,11 +1,10 @@
-"""Rebuilds files of `bench/assets` from a folder with `train/`, `tune.txt` and `test.txt`. Takes hours; can be resumed.
-
-The networks for word sets are not rebuilt: `inversion-ldp.safetensors` and `context.safetensors`.
+"""Rebuilds the files of `bench/assets` from a folder with `train/`, `tune.txt` and `test.txt`. Takes hours; can be resumed.
 
 The photographs of `train/` that are in neither list are split by name into three thirds. The dictionary is built from the first
 two thirds, the attacker's public database from the last. All networks start from one that was trained on raw descriptors of all
 photographs. They are then trained equally long for their own releases, on the last third, which is not part of the dictionary.
-Two networks start from random weights: for positions alone, and for raw oriented descriptors.
+Two networks start from random weights: for positions alone, and for raw oriented descriptors. `train_word_attackers.py` trains
+the attackers of word sets afterwards.
 """
 
 from __future__ import annotations
@@ -19,6 +18,7 @@ from bench.codebook.public import ASSETS
 
 WORDS, PUBLIC_WORDS = 256_000, 128_000
 DEFENSES = ("none", "affine")
+SETS = ("01", "02", "12", "2", "012")  # of thirds of the photographs
 
 
 def main() -> None:
@@ -51,7 +51,7 @@ def split_photographs(data: Path, work: Path) -> dict[str, Path]:
     """Create folders of links to the photographs of each set: unions of thirds named by their digits, and `tune`."""
     tune, test = (set((data / f"{name}.txt").read_text().split()) for name in ("tune", "test"))
     names = sorted(path.name for path in (data / "train").iterdir() if path.name not in tune | test)
-    sets = {digits: [name for number, name in enumerate(names) if str(number % 3) in digits] for digits in ("01", "2", "012")}
+    sets = {digits: [name for number, name in enumerate(names) if str(number % 3) in digits] for digits in SETS}
     folders = {}
     for name, members in {**sets, "tune": sorted(tune)}.items():
         folders[name] = work / name

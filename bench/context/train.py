@@ -1,4 +1,4 @@
-"""Training of the context model on co-occurrences of words in public photographs, in two stages.
+"""Losses of the context model, which learns co-occurrences of words in public photographs in two stages.
 
 1. Pairs: the log-ratio of two words at a displacement, by noise contrast. The true words of two neighbours are distinguished from
    a pair with a uniformly random word, and from a pair with the true word of another keypoint. All words are known in this stage.
@@ -10,9 +10,7 @@ The first stage is necessary: from releases of small ε alone the log-ratios are
 from __future__ import annotations
 
 import dataclasses
-import math
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,13 +22,8 @@ from bench.api import Defense
 from bench.codebook.public import Public
 from bench.codebook.true_words import find_true_candidates, find_true_words
 from bench.context.encoding import build_graph, prior_odds
-from bench.context.network import Belief, ContextModel, KeypointGraph, Shape, encode_offsets
+from bench.context.network import Belief, ContextModel, KeypointGraph, encode_offsets
 from bench.core.device import pick_device
-from bench.core.progress import Progress
-from bench.images.views import PhotographView
-from bench.inversion.data import SupportedSettings, draw_crop
-from bench.inversion.optimizer import Optimizer
-from bench.inversion.plan import Training
 from bench.types import Features, WordSets
 
 ANCHORS = 400  # keypoints of an example whose pairs are used in the first stage
@@ -67,32 +60,8 @@ def build_example(
     )
 
 
-def build_sampler(
-    views: Sequence[PhotographView],
-    defense: Defense,
-    supported: SupportedSettings,
-    size: str,
-    public: Public,
-    neighbours: int,
-    batch: int,
-) -> Callable[[np.random.Generator], Example]:
-    """Return a function that draws examples: random crops of random views under random settings.
-
-    The field `size` is the same for all crops of an example.
-    """
-
-    def draw(rng: np.random.Generator) -> Example:
-        secrets = [draw_crop(views[number], rng)[1] for number in rng.integers(len(views), size=batch)]
-        common = {size: supported[size].sample(rng)}
-        settings = [{field: setting.sample(rng) for field, setting in supported.items()} | common for _ in secrets]
-        defenses = [dataclasses.replace(defense, **values) for values in settings]  # type: ignore[type-var]  # plugins are dataclasses
-        return build_example(secrets, defenses, public, neighbours, rng)
-
-    return draw
-
-
-def compute_pair_loss(module: ContextModel, example: Example) -> Tensor:
-    """Return the loss of the first stage, on a random part of the keypoints. -> ()
+def compute_pair_loss(module: ContextModel, example: Example, anchors: int = ANCHORS) -> Tensor:
+    """Return the loss of the first stage, on the pairs of `anchors` random keypoints. -> ()
 
     The example has two candidates for each keypoint: the true word and a random one.
 
@@ -104,13 +73,13 @@ def compute_pair_loss(module: ContextModel, example: Example) -> Tensor:
     order = torch.stack([example.labels, 1 - example.labels], dim=1)  # the true word first
     words = module.embed_words(graph.candidates[rows[:, None], order])  # (P, 2, width)
     ratings = module.rate_alone(words, module.embed_positions(dataclasses.replace(graph, odds=torch.zeros_like(graph.odds))))
-    anchors = torch.randperm(count, device=rows.device)[:ANCHORS]  # A of the keypoints
-    near, present = graph.neighbours[anchors], graph.present[anchors]  # (A, k)
-    shift = module.shift(encode_offsets(graph.offsets[anchors]))
+    chosen = torch.randperm(count, device=rows.device)[:anchors]  # (A,)
+    near, present = graph.neighbours[chosen], graph.present[chosen]  # (A, k)
+    shift = module.shift(encode_offsets(graph.offsets[chosen]))
     keys = module.project(module.key, words)  # (P, 2, s, rank)
     others = keys[torch.randperm(count, device=rows.device), :1]  # (P, 1, s, rank) true words, of other keypoints
     queries, bias = (
-        module.gate_queries(words[anchors, :1], shift),
+        module.gate_queries(words[chosen, :1], shift),
         module.bias(shift)[:, :, None],
     )  # (A, k, 1, s, rank), (A, k, 1, s)
     ratios = module.combine(queries, torch.cat([keys, others], dim=1)[near], bias)  # (A, k, 3)
@@ -120,54 +89,11 @@ def compute_pair_loss(module: ContextModel, example: Example) -> Tensor:
     return (losses * present).sum() / present.sum().clamp_min(1) + alone.mean()
 
 
-def compute_loss(module: ContextModel, example: Example) -> Tensor:
-    """Return the loss of the second stage. -> ()"""
+def compute_loss(module: ContextModel, example: Example, weight: float = 1.0) -> Tensor:
+    """Return the loss of the second stage, with a weight of the term of the cosine. -> ()"""
     belief = module(example.graph)
     cosine = (belief.mean(example.graph.candidates) * example.descriptors).sum(dim=1).mean()
-    return nnf.cross_entropy(belief.logits, example.labels) + 1 - cosine
-
-
-@dataclass(frozen=True, kw_only=True)
-class Stage:
-    """A stage of the training: its examples, its loss and its number of steps."""
-
-    draw: Callable[[np.random.Generator], Example]
-    loss: Callable[[ContextModel, Example], Tensor]
-    steps: int
-
-
-def fit(shape: Shape, stages: Sequence[Stage], training: Training) -> ContextModel:
-    """Train from random weights in stages, and return the network of averaged weights.
-
-    The examples have the seeds (seed, stage, step). In each stage the rate rises to `training.rate`, then falls to zero by a
-    cosine.
-    """
-    torch.manual_seed(training.seed)
-    device = pick_device()
-    module = ContextModel(shape).to(device)
-    average = {name: value.clone() for name, value in module.state_dict().items()}
-    optimizer = Optimizer(module, training.rate, training.decay)
-    started, smooth, done = time.monotonic(), math.nan, 0
-    with Progress("training", sum(stage.steps for stage in stages)) as progress:
-        for number, stage in enumerate(stages):
-            for step in range(stage.steps):
-                optimizer.rate = training.rate * min(
-                    (step + 1) / training.warmup, 0.5 * (1 + math.cos(math.pi * step / stage.steps))
-                )
-                value = stage.loss(module, stage.draw(np.random.default_rng([training.seed, number, step])).to(device))
-                module.zero_grad()
-                value.backward()
-                torch.nn.utils.clip_grad_norm_(module.parameters(), 1.0)
-                optimizer.step()
-                done += 1
-                decay = min(training.average, done / (done + 9))  # small at first, while the weights change fast
-                for name, weight in module.state_dict().items():
-                    average[name].lerp_(weight, 1 - decay)
-                smooth = float(value.detach()) if step == 0 else 0.98 * smooth + 0.02 * float(value.detach())
-                speed = done * training.batch / (time.monotonic() - started)
-                progress.advance(1, f"stage {number + 1}, loss {smooth:.4f}, {speed:.1f} images/s")
-    module.load_state_dict(average)
-    return module.eval()
+    return nnf.cross_entropy(belief.logits, example.labels) + weight * (1 - cosine)
 
 
 @torch.no_grad()

@@ -3,11 +3,13 @@
 import dataclasses
 import itertools
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 import torch.nn.functional as nnf
+from train_word_attackers import Stage, fit
 
 from attacks.context import Context
 from bench.api import View
@@ -16,13 +18,11 @@ from bench.codebook.public import ASSETS, Public
 from bench.context import weights
 from bench.context.encoding import MAX_LOG_ODDS, build_graph, find_nearest_keypoints, find_reverse_edges, log_odds
 from bench.context.network import ContextModel, Shape, compute_probabilities, propagate
-from bench.context.train import Example, Stage, build_example, build_sampler, compute_loss, compute_pair_loss, fit, validate
+from bench.context.train import Example, build_example, compute_loss, compute_pair_loss, validate
 from bench.core.errors import UserError
 from bench.extractors.sift import Sift
 from bench.geometry.nearest_words import unit_rows
 from bench.images import photographs
-from bench.images.views import PhotographView
-from bench.inversion.plan import Training
 from bench.inversion.train import check_quantisation
 from bench.mechanisms.subset import draw_word_subsets, log10_chance
 from bench.settings import Asset
@@ -138,13 +138,13 @@ def enumerate_posterior(sets: np.ndarray) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def trained() -> ContextModel:
+def trained(tmp_path_factory) -> ContextModel:
     shape = Shape(length=WORDS, width=24, rank=12, neighbours=LINKS - 1, layers=1, kernels=4)
-    return fit(shape, build_stages(64, 100, 200), Training(batch=1, rate=1e-2, warmup=10, average=0.95))
+    return train(shape, 64, (100, 200), tmp_path_factory.mktemp("checkpoints"))
 
 
-def build_stages(chains: int, *steps: int) -> list[Stage]:
-    """Return the stages of a training in this world. In the first, every set holds the true word and a random one."""
+def train(shape: Shape, chains: int, steps: tuple[int, int], folder: Path, seed: int = 0) -> ContextModel:
+    """Train in this world, in two stages. In the first, every set holds the true word and a random one."""
 
     def draw_pairs(rng: np.random.Generator) -> Example:
         true, _ = draw_chains(chains, rng)
@@ -154,7 +154,22 @@ def build_stages(chains: int, *steps: int) -> list[Stage]:
     def draw(rng: np.random.Generator) -> Example:
         return build_world(*draw_chains(chains, rng))
 
-    return [Stage(draw=draw_pairs, loss=compute_pair_loss, steps=steps[0]), Stage(draw=draw, loss=compute_loss, steps=steps[1])]
+    torch.manual_seed(seed)
+    module = ContextModel(shape)
+    stages = ("pairs", draw_pairs, compute_pair_loss), ("releases", draw, compute_loss)
+    for number, (name, examples, loss) in enumerate(stages):
+        stage = Stage(
+            name=name,
+            number=number,
+            steps=steps[number],
+            rate=1e-2,
+            average=0.95,
+            loss=lambda module, rng, loss=loss, examples=examples: loss(module, examples(rng)),
+            warmup=10,
+            seed=seed,
+        )
+        fit(module, stage, folder / f"{name}-{seed}", "")
+    return module
 
 
 @torch.no_grad()
@@ -196,9 +211,12 @@ def test_without_context_it_is_at_chance(trained):
     assert loss > evaluate(ContextModel(trained.shape).eval(), example)[1]
 
 
-def test_training_is_reproducible():
+def test_training_is_reproducible(tmp_path):
     shape = Shape(length=WORDS, width=8, rank=4, neighbours=3, layers=1, kernels=2)
-    once, again, other = (fit(shape, build_stages(4, 2, 3), Training(batch=1, seed=seed)).state_dict() for seed in (0, 0, 1))
+    runs = ("once", 0), ("again", 0), ("other", 1)
+    for name, _ in runs:
+        (tmp_path / name).mkdir()
+    once, again, other = (train(shape, 4, (2, 3), tmp_path / name, seed).state_dict() for name, seed in runs)
     assert all(torch.equal(once[name], again[name]) for name in once)
     assert not all(torch.equal(once[name], other[name]) for name in once)
 
@@ -373,20 +391,6 @@ def test_an_example_labels_the_true_candidate(tmp_path):
     expected = [MAX_LOG_ODDS, log_odds(log10_chance(6.0, len(words), 2), 2)]
     np.testing.assert_allclose(example.graph.odds.numpy(), np.repeat(expected, 30), rtol=1e-6)
     assert np.array_equal(example.descriptors.numpy(), np.concatenate([secret.descriptors for secret in secrets]))
-
-
-def test_examples_are_crops_under_supported_settings(tmp_path):
-    defense = LDP(dictionary=write_dictionary(tmp_path))
-    features = draw_features(200)
-    large = dataclasses.replace(features, keypoints=features.keypoints * 1.25, size=(320, 320))
-    view = PhotographView("made-up", np.zeros((320, 320, 3), np.uint8), large)
-    supported = {field: LDP.supported_settings[field] for field in ("epsilon", "subset_size")}
-    draw = build_sampler([view], defense, supported, "subset_size", Public(), 4, 3)
-    examples = [draw(np.random.default_rng(seed)) for seed in range(8)]
-    assert {example.graph.candidates.shape[1] for example in examples} == {1, 2, 3, 4}
-    assert all(len(example.graph.odds.unique()) == 3 for example in examples)  # one ε for each crop
-    assert all(3 * 80 < len(example.labels) < 3 * 180 for example in examples)  # about 0.64 of 200
-    assert all(example.graph.positions.abs().max() <= 1 for example in examples)
 
 
 def test_an_untrained_network_is_validated_as_the_prior(tmp_path):
