@@ -31,7 +31,7 @@ from bench.codebook.public import ASSETS, Public
 from bench.context import weights as context
 from bench.core.errors import UserError
 from bench.inversion.symmetry import Symmetry, find_symmetries
-from bench.inversion.weights import Network, explain_incompatible, load
+from bench.inversion.weights import Network, explain_incompatible, list_defenses, load
 from bench.settings import Asset
 from bench.threat_model import PublicAssets
 from bench.types import Descriptors, Floats, Release, Subspaces, WordSets
@@ -59,15 +59,14 @@ class DIA(ImageAttack):
         return {"weights": network.verify()}  # its metadata have the digest of the context model
 
     def reconstruct(self, view: View, rng: np.random.Generator) -> Floats:
-        from bench.inversion.encoding import encode_settings
         from bench.inversion.reconstruct import reconstruct_image
 
         public = view.know(PublicAssets).assets
         network = self._network(view.defense, view.extractor, public)
-        settings = encode_settings(view.defense, network.supported_settings)
         symmetries = find_symmetries(view.extractor)
         if network.meta["encoding"] == "posteriors":
             return _weigh_and_reconstruct(network, view.release, view.defense, symmetries, public)
+        settings = network.encode_settings(view.defense, public)
         return reconstruct_image(
             network.module, view.release, symmetries, settings, network.meta["slots"], network.meta["encoding"]
         )
@@ -115,7 +114,7 @@ def _choose(asset: str, defense: Defense, extractor: Extractor, public: Public) 
         reason = explain_incompatible(meta, defense, extractor, public)
         if reason is None:
             return path, None
-        if asset not in SHIPPED or meta["defense"]["name"] == defense.name():
+        if asset not in SHIPPED or defense.name() in list_defenses(meta):
             reasons.append(f"{path.name} was {reason}")
     details = f" ({'; '.join(reasons)})" if reasons else ""
     command = "bench train --encoding released" if asset == "shipped-as-printed" else "bench train"

@@ -16,8 +16,9 @@ Limits: |K| is so large that the descriptor's own pattern is almost never releas
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -26,6 +27,7 @@ from bench.codebook.public import Public
 from bench.core.errors import UserError
 from bench.geometry.nearest_words import unit_rows
 from bench.mechanisms.subset import draw_pattern_subsets, log10_chance
+from bench.settings import Between, OneOf
 from bench.types import Bytes, Features, Floats, Points, WordSets
 
 LENGTH = 128  # components of a descriptor; |K| depends on it
@@ -37,6 +39,10 @@ class NaiveLDP(Defense):
     """Releases a random set of bit patterns, which almost never contains the descriptor's own pattern."""
 
     releases = WordSets
+    supported_settings: ClassVar[Mapping[str, Between | OneOf]] = {
+        "epsilon": Between(0.0, 32.0),
+        "subset_size": OneOf((1, 2, 3, 4)),
+    }
 
     epsilon: float = 10.0  # nats, per descriptor
     subset_size: int = 2  # patterns released per keypoint

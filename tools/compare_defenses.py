@@ -33,6 +33,7 @@ from bench.extractors.sift import Sift
 from bench.images.photographs import list_photographs
 from bench.images.scene import Scene
 from bench.inversion import weights
+from bench.inversion.data import Target
 from bench.inversion.plan import Plan, Training
 from bench.inversion.train import train
 from bench.registry import discovery, spec
@@ -142,8 +143,7 @@ class Study:
         given = "" if name == "privunit" else f":words={WORDS}"
         print(f"network for {name}", flush=True)
         plan = Plan(
-            defense=spec.read(name + given, discovery.DEFENSE),
-            supported_settings=SUPPORTED[name],
+            targets=[Target(defense=spec.read(name + given, discovery.DEFENSE), supported_settings=SUPPORTED[name])],
             photographs=self.photographs,
             validation=self.validation,
             extractor=Sift(),

@@ -65,7 +65,7 @@ from bench.identification import thumbnails
 from bench.images.photographs import SIDE, Source, list_photographs
 from bench.images.views import PhotographView, collect_views
 from bench.inversion import weights
-from bench.inversion.data import assign_dictionaries, measure_quantisation_error
+from bench.inversion.data import Target, assign_dictionaries, measure_quantisation_error
 from bench.inversion.loss import ssim
 from bench.inversion.network import Inverter
 from bench.inversion.optimizer import Optimizer
@@ -293,7 +293,7 @@ def train_context(
         ]
         print_rows(stage.name, rows)
     described = {
-        **weights.describe(LDP(), dict(LDP.supported_settings), Sift(), Public()),
+        **weights.describe([Target(defense=LDP(), supported_settings=LDP.supported_settings)], Sift(), Public()),
         **meta,
         "crops": round(PAIR_BATCH * (pair_steps + 7 / 16 * steps)),  # of releases: a half for 3/4 of the steps, else a quarter
         "batch": PAIR_BATCH,
@@ -355,7 +355,7 @@ def train_inverter(
     ]
     print_rows(stage.name, rows)
     described = {
-        **weights.describe(LDP(), dict(LDP.supported_settings), Sift(), Public()),
+        **weights.describe([Target(defense=LDP(), supported_settings=LDP.supported_settings)], Sift(), Public()),
         **meta,
         "photographs": len(meta["photographs"]),
         "encoding": "posteriors",

@@ -38,7 +38,7 @@ from bench.extractors.sift import Sift
 from bench.images.photographs import list_photographs
 from bench.images.views import PhotographView, collect_views
 from bench.inversion import weights
-from bench.inversion.data import Example, Examples
+from bench.inversion.data import Example, Examples, Target
 from bench.inversion.encoding import CELL, EncodedRelease
 from bench.inversion.learner import Learner
 from bench.inversion.loss import LUMA, WEIGHT, ssim
@@ -315,8 +315,10 @@ def try_idea(idea: Idea, args: argparse.Namespace) -> dict[str, Any]:
     photographs, tune = (load_views(args, which, idea.upright) for which in ("012", "tune"))
     symmetries = find_symmetries(Sift(upright=idea.upright))
     under = symmetries if idea.turned else (IDENTITY,)
-    examples = Examples(photographs[: 4 * idea.photographs], Undefended(), {}, {}, Public(), under)
-    unseen = Examples(tune, Undefended(), {}, {}, Public())
+    examples = Examples(
+        photographs[: 4 * idea.photographs], [Target(defense=Undefended(), supported_settings={})], {}, Public(), under
+    )
+    unseen = Examples(tune, [Target(defense=Undefended(), supported_settings={})], {}, Public())
     torch.manual_seed(0)
     network, training, initial = idea.build_network(), {"warmup": WARMUP, **idea.training}, {}
     if args.initial_checkpoint:

@@ -31,6 +31,14 @@ from bench.types import Bytes, Features, Floats, Indices, Release
 SupportedSettings = Mapping[str, Between | OneOf]
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Target:
+    """Releases that a network is trained for: a defense with its fixed settings, and the settings that are drawn at random."""
+
+    defense: Defense
+    supported_settings: SupportedSettings
+
+
 @dataclass(frozen=True, eq=False)
 class Example:
     """A crop, its release, and the public settings of the defense."""
@@ -42,17 +50,16 @@ class Example:
 
 @dataclass(frozen=True, eq=False)
 class Examples:
-    """A generator of training examples of one defense from a set of views."""
+    """A generator of training examples from a set of views."""
 
     views: Sequence[PhotographView]
-    defense: Defense
-    supported_settings: SupportedSettings
+    targets: Sequence[Target]  # drawn uniformly
     dictionaries: Mapping[str, Asset]  # photograph -> its dictionary; empty if nothing is quantised
     public: Public
     symmetries: Sequence[Symmetry] = (IDENTITY,)  # drawn uniformly
 
     def draw(self, rng: np.random.Generator) -> Example:
-        """Return a random crop of a random view, with random supported settings and a random symmetry.
+        """Return a random crop of a random view, for a random target with random supported settings, and a random symmetry.
 
         Raises
         ------
@@ -71,15 +78,18 @@ class Examples:
         return dataclasses.replace(example, pixels=pixels, release=release)
 
     def release_view(self, view: PhotographView, rng: np.random.Generator) -> Example:
-        """Return a whole view of 256 x 256 pixels and its release, with random supported settings."""
+        """Return a whole view of 256 x 256 pixels and its release, for a random target with random supported settings."""
         return self._release(view.photograph, view.pixels, view.features, rng)
 
     def _release(self, photograph: str, pixels: Bytes, secret: Features, rng: np.random.Generator) -> Example:
-        settings: dict[str, object] = {field: setting.sample(rng) for field, setting in self.supported_settings.items()}
-        if self.defense.dictionary_field is not None:
-            settings[self.defense.dictionary_field] = self.dictionaries[photograph]
-        defense = dataclasses.replace(self.defense, **settings)  # type: ignore[type-var]  # plugins are dataclasses
-        return Example(pixels, defense.protect(secret, self.public, rng), encode_settings(defense, self.supported_settings))
+        number = int(rng.integers(len(self.targets))) if len(self.targets) > 1 else 0
+        target = self.targets[number]
+        settings: dict[str, object] = {field: setting.sample(rng) for field, setting in target.supported_settings.items()}
+        if target.defense.dictionary_field is not None:
+            settings[target.defense.dictionary_field] = self.dictionaries[photograph]
+        defense = dataclasses.replace(target.defense, **settings)  # type: ignore[type-var]  # plugins are dataclasses
+        condition = encode_settings(defense, number, [target.supported_settings for target in self.targets])
+        return Example(pixels, defense.protect(secret, self.public, rng), condition)
 
 
 def draw_crop(view: PhotographView, rng: np.random.Generator) -> tuple[Bytes, Features]:

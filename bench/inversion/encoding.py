@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import singledispatch
 from typing import Literal
@@ -105,14 +105,23 @@ def _build_directions(length: int) -> Floats:
     return np.linalg.qr(normal)[0].T.astype(np.float32)
 
 
-def encode_settings(defense: Defense, supported: Mapping[str, Between | OneOf]) -> Floats:
-    """Return the settings of the defense that the network supports, scaled to [0, 1]. -> (C,)"""
-    scaled = []
-    for field, settings in sorted(supported.items()):
-        value = float(getattr(defense, field))
-        low, high = (settings.low, settings.high) if isinstance(settings, Between) else _find_extremes(settings)
-        scaled.append((value - low) / (high - low) if high > low else 0.0)
-    return np.array(scaled, dtype=np.float32)
+def encode_settings(defense: Defense, number: int, supported: Sequence[Mapping[str, Between | OneOf]]) -> Floats:
+    """Return the settings of the defense that the network supports, scaled to [0, 1]. -> (C,)
+
+    `supported` has the supported settings of each target of the network, and `number` is the defense's target. If there are
+    several, each has columns of its own: an indicator and its settings. They are zero for other targets.
+    """
+    parts = []
+    for target, settings in enumerate(supported):
+        scaled = [_scale(defense, field, setting) if target == number else 0.0 for field, setting in sorted(settings.items())]
+        parts += ([float(target == number)] if len(supported) > 1 else []) + scaled
+    return np.array(parts, dtype=np.float32)
+
+
+def _scale(defense: Defense, field: str, setting: Between | OneOf) -> float:
+    value = float(getattr(defense, field))
+    low, high = (setting.low, setting.high) if isinstance(setting, Between) else _find_extremes(setting)
+    return (value - low) / (high - low) if high > low else 0.0
 
 
 def _find_extremes(settings: OneOf) -> tuple[float, float]:

@@ -20,8 +20,13 @@ def build_key(plan: Plan) -> dict[str, Any]:
     """Return all inputs of the training."""
     public = Public()
     return {
-        "defense": spec.to_json_with_digests(plan.defense, public),
-        "served": {field: str(setting) for field, setting in plan.supported_settings.items()},
+        "targets": [
+            {
+                "defense": spec.to_json_with_digests(target.defense, public),
+                "supported": {field: str(setting) for field, setting in target.supported_settings.items()},
+            }
+            for target in plan.targets
+        ],
         "photographs": [source.content_hash() for source in plan.photographs],
         "validation": [source.content_hash() for source in plan.validation],
         "extractor": spec.to_json(plan.extractor),
@@ -30,7 +35,11 @@ def build_key(plan: Plan) -> dict[str, Any]:
         "encoding": plan.encoding,
         "widths": list(plan.widths),
         "training": dataclasses.asdict(plan.training),
-        "source": provenance.hash_modules(train.__name__, type(plan.defense).__module__, type(plan.extractor).__module__),
+        "source": provenance.hash_modules(
+            train.__name__,
+            *sorted({type(target.defense).__module__ for target in plan.targets}),
+            type(plan.extractor).__module__,
+        ),
         "environment": environment.describe_platform(),
     }
 

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from bench.api import Defense, Extractor
+from bench.api import Extractor
 from bench.core.errors import UserError
 from bench.images.photographs import Source
-from bench.inversion.data import SupportedSettings
+from bench.inversion.data import Target
 from bench.inversion.encoding import Encoding
 from bench.inversion.network import COARSENET, Shape
 from bench.settings import Asset
@@ -36,8 +36,7 @@ class Training:
 class Plan:
     """One training. The training set and the validation set must not have a photograph in common."""
 
-    defense: Defense  # with its fixed settings
-    supported_settings: SupportedSettings  # fields whose settings are drawn at random in training
+    targets: Sequence[Target]  # one network for all of them; their defenses share a dictionary
     photographs: Sequence[Source]
     validation: Sequence[Source]
     extractor: Extractor

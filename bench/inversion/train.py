@@ -1,4 +1,4 @@
-"""Training of an attacker's network for the releases of one defense.
+"""Training of an attacker's network for the releases of one or several defenses.
 
 Each example is a function of (seed, step, index in the batch) alone. So a resumed training gives the same network, and several
 processes can split a batch.
@@ -21,7 +21,6 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from bench.api import Defense
 from bench.codebook.public import Public
 from bench.core.device import pick_device
 from bench.core.errors import UserError
@@ -32,7 +31,7 @@ from bench.inversion import weights
 from bench.inversion.data import (
     Example,
     Examples,
-    SupportedSettings,
+    Target,
     assign_dictionaries,
     check_dictionary_sizes,
     measure_quantisation_error,
@@ -48,7 +47,7 @@ from bench.inversion.process_group import ProcessGroup, launch
 from bench.inversion.reconstruct import infer
 from bench.inversion.symmetry import POSITION_SYMMETRIES, find_symmetries
 from bench.settings import Asset, OneOf
-from bench.types import WordSets
+from bench.types import Subspaces, WordSets
 
 CHECKPOINT = "inversion-checkpoint"
 CHECKPOINT_EVERY = 250  # steps
@@ -79,7 +78,8 @@ def train(plan: Plan, out: Path, log: Path | None = None, devices: int = 1) -> d
 def train_worker(group: ProcessGroup, plan: Plan, out: Path, log: Path | None) -> dict[str, Any]:
     """Execute `train` in one process of the group."""
     writer = Log(log if group.is_main else None)
-    defense, extractor, encoding, training = plan.defense, plan.extractor, plan.encoding, plan.training
+    targets, extractor, encoding, training = plan.targets, plan.extractor, plan.encoding, plan.training
+    sets = _check_targets(targets)
     shared = {source.content_hash() for source in plan.photographs} & {source.content_hash() for source in plan.validation}
     if shared:
         raise UserError(f"{len(shared)} photographs are in both the training and the validation set; remove them from one set")
@@ -89,14 +89,14 @@ def train_worker(group: ProcessGroup, plan: Plan, out: Path, log: Path | None) -
     examples, held_out, errors = _build_examples(plan, views, unseen)
     symmetries = POSITION_SYMMETRIES if encoding == "positions" else find_symmetries(extractor)
     examples = dataclasses.replace(examples, symmetries=symmetries)
-    slots, length = _measure_stack(defense, held_out, unseen[0], encoding)
+    slots, length = _measure_stack(held_out, unseen[0], encoding)
     first = held_out.release_view(unseen[0], np.random.default_rng(0))
     sample = encode([first.release], [first.settings], slots, encoding)
-    candidates = slots if encoding == "invariant" and defense.releases is WordSets else 0
+    candidates = slots if encoding == "invariant" and sets else 0
     shape = Shape(inputs=sample.values.shape[1], candidates=candidates, length=length, widths=plan.widths)
     initial = None if plan.initial_checkpoint is None else weights.load(plan.initial_checkpoint)
     meta = {
-        **weights.describe(defense, dict(plan.supported_settings), extractor, Public()),
+        **weights.describe(targets, extractor, Public()),
         "encoding": encoding,
         "slots": slots,
         "start": initial and initial.digest,
@@ -116,7 +116,7 @@ def train_worker(group: ProcessGroup, plan: Plan, out: Path, log: Path | None) -
         return finished
     trainer = _Trainer(group, shape, training, out, meta, writer)
     if initial is not None and trainer.step == 0:
-        descriptor_slots = slots if defense.releases is WordSets and not candidates else 1
+        descriptor_slots = slots if sets and not candidates else 1
         trainer.load_initial_checkpoint(initial.module, descriptor_slots)
     module = trainer.run(examples)
     if not group.is_main:
@@ -140,21 +140,21 @@ def _build_examples(
     plan: Plan, views: Sequence[PhotographView], unseen: list[PhotographView]
 ) -> tuple[Examples, Examples, dict[str, float] | None]:
     """Return training and validation examples, and the quantisation error on both if descriptors are quantised."""
-    defense, supported = plan.defense, plan.supported_settings
-    if defense.dictionary_field is None:
-        return Examples(views, defense, supported, {}, Public()), Examples(unseen, defense, supported, {}, Public()), None
-    own = Asset(getattr(defense, defense.dictionary_field))
+    targets = plan.targets
+    own = _find_dictionary(targets)
+    if own is None:
+        return Examples(views, targets, {}, Public()), Examples(unseen, targets, {}, Public()), None
     plain = Public()
     assigned = assign_dictionaries(collect_photograph_hashes(views), [own, *plan.crossfit], plain)
     assigned_unseen = assign_dictionaries(collect_photograph_hashes(unseen), [own], plain)
-    sizes = _list_sizes(defense, supported)
+    sizes = _list_sizes(targets)
     check_dictionary_sizes({*assigned.values(), *assigned_unseen.values()}, sizes, plain)
     public = (
         Public(cache_size=0) if isinstance(views, LazyViews) else Public(quantise(views, assigned, sizes, plain), cache_size=0)
     )
     examples, held_out = (
-        Examples(views, defense, supported, assigned, public),
-        Examples(unseen, defense, supported, assigned_unseen, plain),
+        Examples(views, targets, assigned, public),
+        Examples(unseen, targets, assigned_unseen, plain),
     )
     compared = views[:: 4 * math.ceil(len(views) / (4 * MAX_COMPARED))]  # unmirrored, at 256 pixels
     errors = {
@@ -165,12 +165,47 @@ def _build_examples(
     return examples, held_out, errors
 
 
-def _list_sizes(defense: Defense, supported: SupportedSettings) -> list[int]:
+def _check_targets(targets: Sequence[Target]) -> bool:
+    """Return whether any target releases word sets.
+
+    Raises
+    ------
+    UserError
+        if some, but not all, release subspaces.
+    """
+    releases = {target.defense.releases for target in targets}
+    if Subspaces in releases and len(releases) > 1:
+        raise UserError(
+            "--defense: a network for subspaces reads no other releases; train another network for the other defenses"
+        )
+    return WordSets in releases
+
+
+def _find_dictionary(targets: Sequence[Target]) -> Asset | None:
+    """Return the dictionary by which the targets quantise descriptors; None if none of them does.
+
+    Raises
+    ------
+    UserError
+        if they use several.
+    """
+    defenses = [target.defense for target in targets]
+    used = {getattr(defense, defense.dictionary_field) for defense in defenses if defense.dictionary_field is not None}
+    if len(used) > 1:
+        raise UserError(f"--defense: one network needs one dictionary, got {', '.join(sorted(used))}")
+    return Asset(used.pop()) if used else None
+
+
+def _list_sizes(targets: Sequence[Target]) -> list[int]:
     """Return the sizes of the dictionary in training: 0, which stands for all words, first, then descending."""
-    if defense.word_count_field is None:
-        return [0]
-    setting = supported.get(defense.word_count_field)
-    sizes = [int(size) for size in setting.values] if isinstance(setting, OneOf) else [getattr(defense, defense.word_count_field)]
+    sizes: set[int] = set()
+    for defense, supported in ((target.defense, target.supported_settings) for target in targets):
+        if defense.dictionary_field is None:
+            continue
+        setting = OneOf((0,)) if defense.word_count_field is None else supported.get(defense.word_count_field)
+        sizes |= (
+            set(map(int, setting.values)) if isinstance(setting, OneOf) else {getattr(defense, str(defense.word_count_field))}
+        )
     return sorted(sizes, key=lambda size: (size > 0, -size))
 
 
@@ -190,13 +225,27 @@ def check_quantisation(training: float, validation: float) -> None:
         )
 
 
-def _measure_stack(defense: Defense, examples: Examples, view: PhotographView, encoding: Encoding) -> tuple[int, int]:
-    """Return the maximum number of candidates per keypoint over the supported settings, and the length of one."""
-    most = {field: max(setting.values) for field, setting in examples.supported_settings.items() if isinstance(setting, OneOf)}
-    fixed = {field: OneOf((value,)) for field, value in most.items()}
-    largest = Examples(examples.views, defense, {**examples.supported_settings, **fixed}, examples.dictionaries, examples.public)
-    _, slots, length = stack(largest.release_view(view, np.random.default_rng(0)).release, encoding).shape
-    return slots, length
+def _measure_stack(examples: Examples, view: PhotographView, encoding: Encoding) -> tuple[int, int]:
+    """Return the maximum number of candidates per keypoint over the targets and their settings, and the length of one.
+
+    Raises
+    ------
+    UserError
+        if the targets release descriptors of several lengths.
+    """
+    slots, lengths = 0, set()
+    for target in examples.targets:
+        most = {
+            name: OneOf((max(given.values),)) for name, given in target.supported_settings.items() if isinstance(given, OneOf)
+        }
+        largest = dataclasses.replace(target, supported_settings={**target.supported_settings, **most})
+        release = dataclasses.replace(examples, targets=[largest]).release_view(view, np.random.default_rng(0)).release
+        _, used, length = stack(release, encoding).shape
+        slots = max(slots, used)
+        lengths.add(length)
+    if len(lengths) > 1:
+        raise UserError(f"--defense: one network reads descriptors of one length, got {sorted(lengths)}")
+    return slots, lengths.pop()
 
 
 def _checkpoint_path(out: Path) -> Path:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,21 +18,16 @@ from bench.formats import tensor_file
 from bench.formats.network_file import NetworkFile, build_module
 from bench.registry import fields, spec
 from bench.settings import Between, OneOf
+from bench.types import Floats
 
 if TYPE_CHECKING:
     from torch import nn
 
+    from bench.inversion.data import Target
     from bench.inversion.network import Inverter, Shape
 
 KIND = "inversion-network"
-REQUIRED_METADATA = (
-    "defense",
-    "encoding",
-    "extractor",
-    "serves",
-    "shape",
-    "slots",
-)  # metadata for inference
+REQUIRED_METADATA = ("defense", "encoding", "extractor", "serves", "shape", "slots")  # metadata for inference
 STAGE_METADATA = ("start", "crops", "batch", "photographs", "rate", "symmetries")  # metadata of each training stage
 
 
@@ -65,9 +61,13 @@ class Network(NetworkFile):
         module.eval().to(pick_device(), memory_format=torch.channels_last)  # type: ignore[call-overload]
         return module
 
-    @property
-    def supported_settings(self) -> dict[str, Between | OneOf]:
-        return {field: _decode_setting(text) for field, text in self.meta["serves"].items()}
+    def encode_settings(self, defense: Defense, public: Public) -> Floats:
+        """Return the input that describes the settings of a compatible defense. -> (C,)"""
+        from bench.inversion.encoding import encode_settings
+
+        targets = _list_targets(self.meta)
+        number = next(i for i, target in enumerate(targets) if _explain_other_releases(target, defense, public) is None)
+        return encode_settings(defense, number, [_decode_settings(target) for target in targets])
 
 
 def save(path: Path, module: nn.Module, shape: Shape, meta: dict[str, Any]) -> str:
@@ -113,10 +113,15 @@ def _are_metadata(meta: dict[str, Any]) -> bool:
     """Return whether the required metadata have their types."""
     from bench.inversion.encoding import Encoding  # it imports PyTorch
 
-    plugins = (meta["defense"], meta["extractor"])
+    others = meta.get("others", [])
+    if not isinstance(others, list) or not all(isinstance(other, dict) for other in others):
+        return False
+    targets = [meta, *others]
+    plugins = (meta["extractor"], *(target.get("defense") for target in targets))
     if not all(isinstance(plugin, dict) and isinstance(plugin.get("name"), str) for plugin in plugins):
         return False
-    if not isinstance(meta["serves"], dict) or not all(map(_is_setting, meta["serves"].values())):
+    supported = [target.get("serves") for target in targets]
+    if not all(isinstance(settings, dict) and all(map(_is_setting, settings.values())) for settings in supported):
         return False
     return isinstance(meta["shape"], dict) and type(meta["slots"]) is int and meta["encoding"] in get_args(Encoding)
 
@@ -175,29 +180,56 @@ def list_training_stages(meta: dict[str, Any]) -> list[dict[str, Any]]:
     return [*meta.get("earlier", []), {key: meta.get(key) for key in STAGE_METADATA}]
 
 
-def describe(defense: Defense, supported: dict[str, Between | OneOf], extractor: Extractor, public: Public) -> dict[str, Any]:
-    """Return the metadata that describe the releases of a training."""
-    configuration = spec.to_json_with_digests(defense, public)
+def describe(targets: Sequence[Target], extractor: Extractor, public: Public) -> dict[str, Any]:
+    """Return the metadata that describe the releases of a training. Those of the first target are not nested."""
+    first, *others = (_describe_target(target, public) for target in targets)
+    nested = {"others": others} if others else {}
+    return {**first, **nested, "extractor": spec.to_json_with_digests(extractor, public)}
+
+
+def _describe_target(target: Target, public: Public) -> dict[str, Any]:
+    configuration, supported = spec.to_json_with_digests(target.defense, public), target.supported_settings
     return {
         "defense": {field: value for field, value in configuration.items() if field not in supported},
         "serves": {field: _encode_setting(setting) for field, setting in supported.items()},
-        "extractor": spec.to_json_with_digests(extractor, public),
     }
+
+
+def _list_targets(meta: dict[str, Any]) -> list[dict[str, Any]]:
+    return [{"defense": meta["defense"], "serves": meta["serves"]}, *meta.get("others", [])]
+
+
+def list_defenses(meta: dict[str, Any]) -> list[str]:
+    """Return the names of the defenses that a network was trained for, sorted."""
+    return sorted({target["defense"]["name"] for target in _list_targets(meta)})
 
 
 def explain_incompatible(meta: dict[str, Any], defense: Defense, extractor: Extractor, public: Public) -> str | None:
     """Return the reason why a network does not suit the releases of `defense`; None if it was trained for them."""
-    if meta["defense"]["name"] != defense.name():
-        return f"trained for {meta['defense']['name']}"
+    names = list_defenses(meta)
+    if defense.name() not in names:
+        return f"trained for {', '.join(names)}"
+    targets = [target for target in _list_targets(meta) if target["defense"]["name"] == defense.name()]
+    reasons = [_explain_other_releases(target, defense, public) for target in targets]
+    if None not in reasons:
+        return " or ".join(reason for reason in reasons if reason)
+    return explain_other_features(meta, extractor, public)
+
+
+def _explain_other_releases(target: dict[str, Any], defense: Defense, public: Public) -> str | None:
+    """Return the reason why the releases of one target are not those of `defense`."""
+    trained_for, supported = target["defense"], _decode_settings(target)
+    if trained_for["name"] != defense.name():
+        return f"trained for {trained_for['name']}"
     configuration = spec.to_json_with_digests(defense, public)
-    for field, text in meta["serves"].items():
-        if getattr(defense, field) not in _decode_setting(text):
-            return f"trained for {field} {_decode_setting(text)}, not {getattr(defense, field)}"
-    trained = fields.list_defaults(type(defense)) | meta["defense"]  # a field added after the training counts as its default
-    for field in sorted((configuration.keys() | meta["defense"].keys()) - meta["serves"].keys()):
+    for field, setting in supported.items():
+        if getattr(defense, field) not in setting:
+            return f"trained for {field} {setting}, not {getattr(defense, field)}"
+    trained = fields.list_defaults(type(defense)) | trained_for  # a field added after the training counts as its default
+    for field in sorted((configuration.keys() | trained_for.keys()) - supported.keys()):
         if configuration.get(field) != trained.get(field):
             return f"trained for {field} {trained.get(field)}, not {configuration.get(field)}"
-    return explain_other_features(meta, extractor, public)
+    return None
 
 
 def explain_other_features(meta: dict[str, Any], extractor: Extractor, public: Public) -> str | None:
@@ -214,6 +246,10 @@ def explain_other_features(meta: dict[str, Any], extractor: Extractor, public: P
 
 def _encode_setting(setting: Between | OneOf) -> dict[str, list[Any]]:
     return {"between": [setting.low, setting.high]} if isinstance(setting, Between) else {"one_of": list(setting.values)}
+
+
+def _decode_settings(target: dict[str, Any]) -> dict[str, Between | OneOf]:
+    return {field: _decode_setting(text) for field, text in target["serves"].items()}
 
 
 def _decode_setting(text: dict[str, list[Any]]) -> Between | OneOf:

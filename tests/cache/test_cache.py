@@ -31,6 +31,7 @@ from bench.geometry.nearest_words import WordIndex
 from bench.images.photographs import list_photographs
 from bench.inversion import network_cache as networks
 from bench.inversion import weights
+from bench.inversion.data import Target
 from bench.inversion.plan import Plan, Training
 from bench.runner import execute
 from bench.runner.records import Record
@@ -212,8 +213,7 @@ def test_protect_stores_nothing(images: Path, small: Asset) -> None:
 
 def test_network_is_found_by_its_training_plan(images: Path, tmp_path: Path) -> None:
     plan = Plan(
-        defense=Undefended(),
-        supported_settings={},
+        targets=[Target(defense=Undefended(), supported_settings={})],
         photographs=list_photographs(images)[:1],
         validation=list_photographs(images)[1:],
         extractor=Sift(),
@@ -231,7 +231,7 @@ def test_network_is_found_by_its_training_plan(images: Path, tmp_path: Path) -> 
     assert out.read_bytes() == shipped[0].read_bytes()
     assert networks.fetch(key, out) is None  # an existing file is not overwritten
     others: dict[str, Any] = {"training": Training(steps=2), "widths": (8, 9), "photographs": list_photographs(images)[1:]}
-    for field, value in {**others, "defense": Affine()}.items():
+    for field, value in {**others, "targets": [Target(defense=Affine(), supported_settings={})]}.items():
         assert networks.build_key(dataclasses.replace(plan, **{field: value})) != key
 
 

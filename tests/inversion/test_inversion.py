@@ -16,6 +16,7 @@ from bench.images import photographs
 from bench.images.photographs import Source
 from bench.images.views import LazyViews, collect_views
 from bench.inversion import data, weights
+from bench.inversion.data import Target
 from bench.inversion.encoding import EncodedRelease, encode, encode_settings, stack
 from bench.inversion.loss import reconstruction_loss, ssim
 from bench.inversion.network import Inverter, Shape
@@ -26,7 +27,10 @@ from bench.settings import Asset, Between, OneOf
 from bench.types import Descriptors, Points, Subspaces, WordSets
 from defenses.affine import Affine, reparameterise
 from defenses.ldp import LDP
+from defenses.naive_ldp import NaiveLDP
 from defenses.none import Undefended
+from defenses.plateau import Plateau
+from defenses.privunit import PrivUnit
 
 TINY = Training(steps=4, batch=2, warmup=2)
 
@@ -162,8 +166,8 @@ def test_keypoints_on_the_border_stay_in_the_grid():
 
 def test_settings_are_encoded_by_their_supported_range():
     supported = {"epsilon": Between(8.0, 16.0), "subset_size": OneOf((1, 2, 3, 4))}
-    assert np.allclose(encode_settings(LDP(epsilon=10, subset_size=4), supported), [0.25, 1.0])
-    assert encode_settings(Undefended(), {}).shape == (0,)
+    assert np.allclose(encode_settings(LDP(epsilon=10, subset_size=4), 0, [supported]), [0.25, 1.0])
+    assert encode_settings(Undefended(), 0, [{}]).shape == (0,)
 
 
 def scatter(net, values, coordinates, size=(64, 48)):
@@ -226,10 +230,15 @@ def test_loss_of_the_truth_is_zero(rng):
     assert float(reconstruction_loss(1 - image, image)) > 0.1
 
 
+def fix(defense):
+    """Return a target without random settings."""
+    return Target(defense=defense, supported_settings={})
+
+
 def build_plan(sources, **given):
     """A training on two photographs, validated on a third."""
     data = {"photographs": sources[:2], "validation": sources[2:3], "extractor": Sift(), "widths": (8, 8)}
-    return Plan(**{"defense": Undefended(), "supported_settings": {}} | data | given)
+    return Plan(**{"targets": [fix(Undefended())]} | data | given)
 
 
 @pytest.mark.slow
@@ -238,7 +247,7 @@ def test_a_resumed_training_is_the_same_training(defense, sources, tmp_path, mon
     import bench.inversion.train as module
 
     monkeypatch.setattr(module, "CHECKPOINT_EVERY", 2)
-    plan = build_plan(sources, defense=defense, training=TINY)
+    plan = build_plan(sources, targets=[fix(defense)], training=TINY)
     whole = train(plan, tmp_path / "whole.safetensors")
     # Interrupt the second one after its third step, which is lost.
     advance, steps = module._Trainer._advance, []
@@ -269,7 +278,7 @@ def test_views_on_demand_train_the_same_network(defense, sources, tmp_path, monk
     """Views that do not fit into memory are read repeatedly, with the same result."""
     import bench.inversion.train as module
 
-    plan = build_plan(sources, defense=defense, training=TINY)
+    plan = build_plan(sources, targets=[fix(defense)], training=TINY)
     in_memory = train(plan, tmp_path / "in-memory.safetensors")
     monkeypatch.setattr(module, "MAX_IN_MEMORY", 1)
     on_demand = train(plan, tmp_path / "on-demand.safetensors")
@@ -287,9 +296,9 @@ def test_views_on_demand_skip_unreadable_files(sources, tmp_path, rng):
         assert one.photograph == other.photograph
         assert np.array_equal(one.pixels, other.pixels)
         assert np.array_equal(one.features.codes, other.features.codes)
-    assert data.Examples(lazy, Undefended(), {}, {}, Public()).draw(rng).pixels.shape == (256, 256, 3)
+    assert data.Examples(lazy, [fix(Undefended())], {}, Public()).draw(rng).pixels.shape == (256, 256, 3)
     with pytest.raises(UserError, match="none of 100"):
-        data.Examples(lazy[:4], Undefended(), {}, {}, Public()).draw(rng)
+        data.Examples(lazy[:4], [fix(Undefended())], {}, Public()).draw(rng)
 
 
 @pytest.mark.parametrize(("slots", "candidates"), [(1, 1), (3, 1), (4, 4)])
@@ -391,7 +400,7 @@ def test_dictionaries_must_have_equal_size(sources, words, tmp_path):
     defense = LDP(epsilon=6.0, dictionary=words)
     assert dataclasses.replace(defense, dictionary=few).privacy(public).log10_true > defense.privacy(public).log10_true
     with pytest.raises(UserError, match="different sizes"):
-        train(build_plan(sources, defense=defense, crossfit=[few], training=TINY), tmp_path / "W.safetensors")
+        train(build_plan(sources, targets=[fix(defense)], crossfit=[few], training=TINY), tmp_path / "W.safetensors")
     data.check_dictionary_sizes({words, few}, [2000, 1000], public)  # both have that many words
     with pytest.raises(UserError, match="different sizes"):
         data.check_dictionary_sizes({words, few}, [1000, 0], public)
@@ -426,7 +435,8 @@ def test_a_network_is_incompatible_with_other_releases(sources, words, tmp_path)
     public, path = Public(), tmp_path / "W.safetensors"
     supported = {"epsilon": Between(8.0, 16.0), "subset_size": OneOf((1, 2))}
     shape = Shape(inputs=2 * 128 + 2 + 2)
-    meta = {**weights.describe(LDP(dictionary=words), supported, Sift(), public), "encoding": "released", "slots": 2}
+    target = Target(defense=LDP(dictionary=words), supported_settings=supported)
+    meta = {**weights.describe([target], Sift(), public), "encoding": "released", "slots": 2}
     weights.save(path, Inverter(shape), shape, meta)
     meta = weights.load(path).meta
     compatible = LDP(epsilon=9, subset_size=2, dictionary=words)
@@ -443,7 +453,54 @@ def test_a_network_is_incompatible_with_other_releases(sources, words, tmp_path)
     assert "dictionary sha256" in (weights.explain_incompatible(meta, LDP(dictionary=Asset(copied)), Sift(), public) or "")
 
 
-RAW_METADATA = {**weights.describe(Undefended(), {}, Sift(), Public()), "encoding": "invariant", "slots": 1}
+def test_one_network_for_several_defenses(sources, words, tmp_path):
+    """Words and descriptors, with settings of their own. Control: the network reads which defense it is."""
+    plateau = {"epsilon": Between(8.0, 16.0), "subset_size": OneOf((1, 3))}
+    targets = [
+        Target(defense=Plateau(dictionary=words), supported_settings=plateau),
+        Target(defense=PrivUnit(dictionary=words), supported_settings={"epsilon": Between(4.0, 32.0)}),
+        fix(NaiveLDP()),
+    ]
+    out, public = tmp_path / "W.safetensors", Public()
+    meta = train(build_plan(sources[3:], validation=sources[2:3], targets=targets, training=TINY), out)
+    assert (meta["slots"], weights.list_defenses(meta)) == (3, ["naive-ldp", "plateau", "privunit"])
+    network = weights.load(out)
+    for defense, expected in (
+        (Plateau(dictionary=words, epsilon=10, subset_size=3), [1, 0.25, 1, 0, 0, 0]),
+        (PrivUnit(dictionary=words, epsilon=11), [0, 0, 0, 1, 0.25, 0]),
+        (NaiveLDP(), [0, 0, 0, 0, 0, 1]),
+    ):
+        assert weights.explain_incompatible(network.meta, defense, Sift(), public) is None
+        assert np.allclose(network.encode_settings(defense, public), expected)
+    for defense, reason in (
+        (Plateau(dictionary=words, epsilon=20), "epsilon 8"),
+        (PrivUnit(dictionary=words, centred=False), "centred True"),
+        (LDP(dictionary=words), "trained for naive-ldp, plateau, privunit"),
+    ):
+        assert reason in (weights.explain_incompatible(network.meta, defense, Sift(), public) or "")
+    release = Plateau(dictionary=words, subset_size=1).protect(
+        collect_views(sources[3:4], Sift())[0].features, public, np.random.default_rng(0)
+    )
+    one, other = (
+        infer(network.module, encode([release], [np.array(condition, np.float32)], 3, "invariant"))
+        for condition in ([1, 0, 0, 0, 0, 0], [0, 0, 0, 1, 0, 0])
+    )
+    assert not torch.equal(one, other)
+
+
+@pytest.mark.parametrize(
+    ("defenses", "message"),
+    [
+        ([Affine(), Undefended()], "reads no other releases"),
+        ([Plateau(), LDP(dictionary=Asset("other.safetensors"))], "needs one dictionary"),
+    ],
+)
+def test_defenses_that_one_network_cannot_read_are_refused(sources, tmp_path, defenses, message):
+    with pytest.raises(UserError, match=message):
+        train(build_plan(sources, targets=[fix(defense) for defense in defenses]), tmp_path / "W.safetensors")
+
+
+RAW_METADATA = {**weights.describe([fix(Undefended())], Sift(), Public()), "encoding": "invariant", "slots": 1}
 
 
 def test_saved_weights_give_the_same_network(sources, tmp_path, rng):

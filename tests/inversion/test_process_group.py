@@ -13,6 +13,7 @@ from bench.cli import main
 from bench.extractors.sift import Sift
 from bench.images import photographs
 from bench.inversion import learner, norm, reconstruct, weights
+from bench.inversion.data import Target
 from bench.inversion.network import Shape
 from bench.inversion.plan import PROFILES, Plan, Training
 from bench.inversion.process_group import ProcessGroup, launch
@@ -90,8 +91,7 @@ def build_arguments(folder, name):
     """Build the arguments of `train_worker` after the group."""
     sources = photographs.list_builtin()
     plan = Plan(
-        defense=Undefended(),
-        supported_settings={},
+        targets=[Target(defense=Undefended(), supported_settings={})],
         photographs=sources[:2],
         validation=sources[2:3],
         extractor=Sift(),

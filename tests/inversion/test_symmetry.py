@@ -10,7 +10,7 @@ from bench.extractors.sift import Sift
 from bench.images import photographs
 from bench.images.views import PhotographView
 from bench.inversion import weights
-from bench.inversion.data import Examples
+from bench.inversion.data import Examples, Target
 from bench.inversion.loss import ssim
 from bench.inversion.network import Inverter, Shape
 from bench.inversion.reconstruct import reconstruct_image
@@ -155,7 +155,7 @@ def test_crops_are_drawn_under_every_symmetry(rng):
 
     def measure_cosines(symmetries):
         views = [PhotographView("a", PIXELS, Sift().extract(PIXELS))]
-        examples = Examples(views, Undefended(), {}, {}, Public(), symmetries)
+        examples = Examples(views, [Target(defense=Undefended(), supported_settings={})], {}, Public(), symmetries)
         found = []
         for _ in range(8):
             example = examples.draw(rng)

@@ -13,7 +13,12 @@ REQUIRED = ("defense", "images", "out")
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--defense", metavar="SPEC", help="the defense; fields not given are trained over their supported range")
+    parser.add_argument(
+        "--defense",
+        action="append",
+        metavar="SPEC",
+        help="the defense; fields not given are trained over their supported range. May be repeated: one network for all of them",
+    )
     parser.add_argument("--images", type=Path, metavar="DIR", help="a folder of photographs")
     parser.add_argument("--out", type=Path, metavar="FILE", help="the network's weights, a safetensors file")
     parser.add_argument(
@@ -62,20 +67,22 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def execute(args: argparse.Namespace) -> int:
     from bench.images.photographs import list_photographs, split_validation
     from bench.inversion import network_cache
+    from bench.inversion.data import Target
     from bench.inversion.plan import PROFILES, Plan
     from bench.inversion.train import train
     from bench.registry import discovery, spec
     from bench.settings import Asset
 
-    plugin, given = spec.parse(args.defense, discovery.DEFENSE)
-    defense = spec.build(plugin, given)
-    supported = {name: settings for name, settings in plugin.supported_settings.items() if name not in given}
+    targets = []
+    for text in args.defense:
+        plugin, given = spec.parse(text, discovery.DEFENSE)
+        supported = {name: settings for name, settings in plugin.supported_settings.items() if name not in given}
+        targets.append(Target(defense=spec.build(plugin, given), supported_settings=supported))
     photographs, validation = split_validation(list_photographs(args.images), args.validation)
     profile = PROFILES[args.profile]
     overrides = {name: value for name in ("steps", "batch", "rate", "seed") if (value := getattr(args, name)) is not None}
     plan = Plan(
-        defense=defense,
-        supported_settings=supported,
+        targets=targets,
         photographs=photographs,
         validation=validation,
         extractor=spec.read(args.extractor, discovery.EXTRACTOR),
