@@ -46,4 +46,5 @@ def _write_figure(sample: str, records: Sequence[Record], out: Path, provenance:
     panels = figures.build_panels(original, records, [reconstruction_path(out, record) for record in records])
     # Without the software's version, the same run gives the same file.
     drawing = figures.draw(panels, f"{sample}. {tables.SEED_REMARK}")
-    drawing.savefig(figure, metadata={"Software": None, CHUNK: provenance})
+    metadata = {"Software": None, CHUNK: provenance}
+    drawing.savefig(figure, metadata=metadata, pil_kwargs={"compress_level": 4})

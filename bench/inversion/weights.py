@@ -15,6 +15,7 @@ from bench.codebook.public import Public
 from bench.core.errors import UserError
 from bench.formats import tensor_file
 from bench.formats.network_file import NetworkFile, build_module
+from bench.inversion.encoding import Encoding
 from bench.registry import fields, spec
 from bench.settings import Between, OneOf
 
@@ -111,8 +112,6 @@ def _load(path: Path, version: object) -> Network:
 
 def _are_metadata(meta: dict[str, Any]) -> bool:
     """Return whether the required metadata have their types."""
-    from bench.inversion.encoding import Encoding  # it imports PyTorch
-
     plugins = (meta["defense"], meta["extractor"])
     if not all(isinstance(plugin, dict) and isinstance(plugin.get("name"), str) for plugin in plugins):
         return False
