@@ -133,8 +133,8 @@ def build_run(photographs: Path, out: Path, *options: str) -> list[str]:
 
 def read_run(out: Path) -> tuple[list[dict[str, Any]], dict[str, bytes]]:
     """Return the records of a run without their durations, sorted, and its pictures."""
-    kept = records.keep_latest(records.read(out / records.FILE).records)
-    stable = [{name: value for name, value in record.items() if name not in UNSTABLE} for record in kept]
+    latest = records.keep_latest(records.read(out / records.FILE).records)
+    stable = [{name: value for name, value in record.items() if name not in UNSTABLE} for record in latest]
     pictures = {str(path.relative_to(out)): path.read_bytes() for path in out.glob("**/*.png") if "figures" not in path.parts}
     return sorted(stable, key=lambda record: str(record["sample"])), pictures
 
