@@ -101,7 +101,8 @@ def compare(baseline: Ratios, measured: Ratios) -> list[RegressionResult]:
 def _compare_ratio(name: str, before: float | None, after: float | None) -> RegressionResult:
     build = functools.partial(RegressionResult, defense=name, attack="its floor")
     if before is None or after is None:
-        return build(verdict="new" if before is None else "missing")
+        note = "" if after is None else f"{after:.2f} times its floor"
+        return build(verdict="new" if before is None else "missing", note=note)
     verdict: Verdict = "worse" if after > before * TOLERANCE else "better" if after < before / TOLERANCE else "same"
     allowed = before * (TOLERANCE - 1)
     return build(verdict=verdict, metric="time", before=before, after=after, tolerance=allowed)
