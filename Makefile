@@ -3,6 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 DEMO ?= --defense none --defense affine --defense ldp:epsilon=16 --defense ldp --attack dia --attack keypoints --attack blank --attack oracle
 DATA ?= ../shared/data
+EFFORT ?= 1
 
 SMOKE := --defense none --defense affine --defense ldp:epsilon=16 --attack dia
 SPEED := runs/speed.json
@@ -11,7 +12,7 @@ SPEED := runs/speed.json
 WORKERS ?= logical
 PYTEST := OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -q -n $(WORKERS) --dist worksteal
 
-.PHONY: demo test test-quick test-exhaustive coverage lint smoke check baseline bench assets docs
+.PHONY: demo test test-quick test-exhaustive coverage lint smoke check baseline bench soak assets docs
 
 demo: .venv/ready
 	$(BIN)/bench run $(DEMO)
@@ -52,6 +53,10 @@ bench: .venv/ready-to-test # speed of one core, as ratios within one run, agains
 	OMP_NUM_THREADS=1 $(BIN)/pytest -q --benchmark-only --benchmark-timer=time.process_time \
 		--benchmark-columns=min,median,rounds --benchmark-sort=name --benchmark-json=$(SPEED)
 	$(BIN)/bench check --baseline tests/speed.json --results $(SPEED)
+
+soak: .venv/ready-to-test # kills, flipped bits, damaged files and load: minutes, or hours with EFFORT=20
+	rm -rf runs/soak
+	$(BIN)/python tools/soak.py --work runs/soak --effort $(EFFORT)
 
 docs: .venv/ready-for-docs # the site, in build/site: open index.html from the disk; a warning is an error
 	$(BIN)/mkdocs build --strict

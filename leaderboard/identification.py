@@ -25,7 +25,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import chi2
+from scipy import special
 
 from bench.core.errors import UserError
 from leaderboard.chance import PHOTOGRAPHS, RECIPROCAL_RANK
@@ -93,7 +93,7 @@ def measure_bits(reciprocals: ArrayLike) -> Interval:
         return Interval(0.0, 0.0, 0.0, photographs)
     unique, counts = np.unique(ranks, return_counts=True)
     likelihood = np.log2(_evaluate_codes(unique)) @ (counts / seeds)  # (codes,), of all ranks
-    region = likelihood.max() - likelihood <= chi2.ppf(LEVEL, PARAMETERS) / (2 * math.log(2))
+    region = likelihood.max() - likelihood <= special.chdtri(PARAMETERS, 1 - LEVEL) / (2 * math.log(2))
     expected = _measure_expected_gains()[region]
     gain = max(0.0, TOTAL + float(likelihood.max()) * seeds / len(ranks))  # without rounding errors
     fraction = len(ranks) / len(values)

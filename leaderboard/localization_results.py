@@ -5,8 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-
-import pycolmap
+from typing import TYPE_CHECKING
 
 from bench.core import paths
 from bench.core.errors import UserError
@@ -14,6 +13,9 @@ from bench.datasets import aachen
 from bench.formats import lists, pairs
 from bench.runner.records import Record
 from leaderboard import tables
+
+if TYPE_CHECKING:
+    import pycolmap
 
 ESTIMATES = "estimates"
 

@@ -31,8 +31,10 @@ def write(records: Sequence[Record], out: Path, command: str) -> None:
     (out / "report.md").write_text(markdown, encoding="utf-8", errors="replace")
     (out / "report.csv").write_text(to_csv(*report), encoding="utf-8", errors="replace")
     provenance = format_provenance(command, records)
-    for sample in dict.fromkeys(record["sample"] for record in records):
-        sample_records = [record for record in records if record["sample"] == sample]
+    by_sample: dict[str, list[Record]] = {}
+    for record in records:
+        by_sample.setdefault(record["sample"], []).append(record)
+    for sample, sample_records in by_sample.items():
         if any(os.path.isfile(reconstruction_path(out, record)) for record in sample_records):
             _write_figure(sample, sample_records, out, provenance)
 
@@ -46,4 +48,5 @@ def _write_figure(sample: str, records: Sequence[Record], out: Path, provenance:
     panels = figures.build_panels(original, records, [reconstruction_path(out, record) for record in records])
     # Without the software's version, the same run gives the same file.
     drawing = figures.draw(panels, f"{sample}. {tables.SEED_REMARK}")
-    drawing.savefig(figure, metadata={"Software": None, CHUNK: provenance})
+    metadata = {"Software": None, CHUNK: provenance}
+    drawing.savefig(figure, metadata=metadata, pil_kwargs={"compress_level": 4})

@@ -3,27 +3,45 @@
 Times of two machines cannot be compared. So each group of benchmarks contains floors, such as a bare product of matrices or the
 search of another library. The time of each other benchmark is divided by that of the fastest floor, which differs between
 processors. pytest-benchmark itself compares times with those of earlier runs (`--benchmark-compare`), but no ratios within a run.
+
+Ratios depend on the instructions that the processor has for the floors. So each instruction set has its own reference. The ratios
+of a set without one are new, and not worse.
 """
 
 from __future__ import annotations
 
 import functools
 import json
+import platform
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from bench.core.device import pick_dtype
 from bench.core.errors import UserError
 from leaderboard.regression import RegressionResult, Verdict
 
 TOLERANCE = 2.0  # factor; a busy machine changes ratios by less
 FLOORS = ("bare_product", "random words", "faiss")  # parts of the names of the benchmarks that are floors
+INSTRUCTION_SET = "instruction_set"  # key of the machine's description in files of pytest-benchmark
 
 Ratios = Mapping[str, float]
 
 
-def load_ratios(path: Path) -> Ratios:
-    """Return the committed ratios, by benchmark.
+def name_instruction_set() -> str:
+    """Return the instruction set of this machine's matrix products, such as "x86_64 AVX512 bf16"."""
+    import torch
+
+    parts = (
+        platform.machine(),
+        torch.backends.cpu.get_cpu_capability(),
+        "bf16" * (pick_dtype(torch.device("cpu")) != torch.float32),
+    )
+    return " ".join(filter(None, parts))
+
+
+def load_ratios(path: Path) -> Mapping[str, Ratios]:
+    """Return the committed ratios: instruction set -> benchmark -> ratio.
 
     Raises
     ------
@@ -31,9 +49,26 @@ def load_ratios(path: Path) -> Ratios:
         if the file is missing or has other content.
     """
     content = _load_json(path)
-    if not isinstance(content, dict) or not all(isinstance(value, (int, float)) for value in content.values()):
-        raise UserError(f"{path}: expected an object of ratios, with a number for the name of each benchmark")
+    if not isinstance(content, dict) or not all(map(_are_ratios, content.values())):
+        raise UserError(f"{path}: expected, for the name of each instruction set, an object with a number for each benchmark")
     return content
+
+
+def _are_ratios(content: Any) -> bool:
+    return isinstance(content, dict) and all(isinstance(value, (int, float)) for value in content.values())
+
+
+def read_instruction_set(path: Path) -> str:
+    """Return the instruction set of a `--benchmark-json` file, or "unknown".
+
+    Raises
+    ------
+    UserError
+        if the file is missing or not valid JSON.
+    """
+    content = _load_json(path)
+    machine = content.get("machine_info") if isinstance(content, dict) else None
+    return str(machine.get(INSTRUCTION_SET, "unknown")) if isinstance(machine, dict) else "unknown"
 
 
 def compute_ratios(path: Path) -> Ratios:
@@ -66,7 +101,8 @@ def compare(baseline: Ratios, measured: Ratios) -> list[RegressionResult]:
 def _compare_ratio(name: str, before: float | None, after: float | None) -> RegressionResult:
     build = functools.partial(RegressionResult, defense=name, attack="its floor")
     if before is None or after is None:
-        return build(verdict="new" if before is None else "missing")
+        note = "" if after is None else f"{after:.2f} times its floor"
+        return build(verdict="new" if before is None else "missing", note=note)
     verdict: Verdict = "worse" if after > before * TOLERANCE else "better" if after < before / TOLERANCE else "same"
     allowed = before * (TOLERANCE - 1)
     return build(verdict=verdict, metric="time", before=before, after=after, tolerance=allowed)

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,8 +11,15 @@ from fakes import write_album
 from bench.cache import store
 from bench.codebook.examples import write_dictionary
 from bench.settings import Asset
+from leaderboard import speed
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_benchmark_update_machine_info(machine_info: dict[str, Any]) -> None:
+    """Name the instruction set, whose reference `bench check` compares the ratios with."""
+    machine_info[speed.INSTRUCTION_SET] = speed.name_instruction_set()
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -69,8 +69,11 @@ def list_commands() -> list[str]:
     return sorted(info.name.replace("_", "-") for info in pkgutil.iter_modules(commands.__path__))
 
 
-def build_parser() -> Parser:
-    """Return the parser of all commands. Parsed arguments have `execute`, `required` (names of required options) and `help`."""
+def build_parser(names: Sequence[str] | None = None) -> Parser:
+    """Return the parser of the commands `names`, or of all commands.
+
+    Parsed arguments have `execute`, `required` (names of required options) and `format_help`.
+    """
     text = argparse.RawDescriptionHelpFormatter
     top = Parser(
         prog="bench",
@@ -81,14 +84,14 @@ def build_parser() -> Parser:
     )
     top.add_argument("--version", action="version", version=f"feature-privacy-bench {version('feature-privacy-bench')}")
     subparsers = top.add_subparsers(metavar="COMMAND", parser_class=Parser)
-    for name in list_commands():
+    for name in list_commands() if names is None else names:
         module = importlib.import_module(f"{commands.__name__}.{name.replace('-', '_')}")
         epilog = getattr(module, "EPILOG", "")
         command = subparsers.add_parser(
             name, help=module.SUMMARY, description=module.SUMMARY, epilog=epilog, formatter_class=text, allow_abbrev=False
         )
         module.add_options(command)
-        command.set_defaults(execute=module.execute, required=module.REQUIRED, help=command.format_help())
+        command.set_defaults(execute=module.execute, required=module.REQUIRED, format_help=command.format_help)
     return top
 
 
@@ -103,15 +106,16 @@ def format_command(argv: Sequence[str]) -> str:
 
 
 def _run_command(argv: list[str]) -> int:
-    if argv and not argv[0].startswith("-") and argv[0] not in list_commands():
+    named = bool(argv) and not argv[0].startswith("-")
+    if named and argv[0] not in list_commands():
         raise unknown_name("command", argv[0], list_commands())  # argparse suggests no similar name
-    args, extra = build_parser().parse_known_args(argv)
+    args, extra = build_parser(argv[:1] if named else None).parse_known_args(argv)  # the parsers of all take 50 ms
     if "execute" not in args:
         raise UserError(f"give a command: {', '.join(list_commands())} (see bench --help)")
     if extra:
         option = extra[0].partition("=")[0]
         if option.startswith("-"):
-            raise unknown_name("option", option, set(re.findall(r"--[a-z][a-z-]*", args.help)))
+            raise unknown_name("option", option, set(re.findall(r"--[a-z][a-z-]*", args.format_help())))
         raise UserError(f"{extra[0]!r} is an unexpected argument")
     require(args, args.required, argv[0])
     args.command = format_command(argv)

@@ -6,7 +6,6 @@ import dataclasses
 from collections.abc import Iterator
 from typing import Any
 
-from rich.table import Table as RichTable
 from rich.text import Text
 
 from bench.api import Plugin
@@ -26,7 +25,7 @@ SECTIONS: dict[str, Kind] = {
 }
 
 
-def build_listing(section: str | None) -> Iterator[Table | RichTable | Text]:
+def build_listing(section: str | None) -> Iterator[Table | Text]:
     """Yield one section, or all sections. With defenses or attacks, the table of applicability follows.
 
     Raises
@@ -42,16 +41,15 @@ def build_listing(section: str | None) -> Iterator[Table | RichTable | Text]:
         yield _build_matrix()
 
 
-def _describe(plugin: type[Plugin]) -> Iterator[RichTable | Text]:
+def _describe(plugin: type[Plugin]) -> Iterator[Text]:
     yield Text.assemble("  ", (plugin.name(), "bold"), f"  {plugin.description()}")
-    if not dataclasses.fields(plugin):  # type: ignore[arg-type]
-        return
-    table = RichTable(box=None, show_header=False, padding=(0, 2, 0, 0), pad_edge=False)
     types = fields.resolve_types(plugin)
+    rows = []
     for field in dataclasses.fields(plugin):  # type: ignore[arg-type]
         default = "required" if field.default is dataclasses.MISSING else f"default {_format(field.default)}"
-        table.add_row("     ", Text(field.name), Text(fields.describe_type(types[field.name]) or ""), Text(default))
-    yield table
+        rows.append((field.name, fields.describe_type(types[field.name]) or "", default))
+    name, kind = (max((len(row[index]) for row in rows), default=0) for index in (0, 1))
+    yield from (Text(f"       {row[0]:{name}}  {row[1]:{kind}}  {row[2]}") for row in rows)  # a table of rich is slow
 
 
 def _format(value: Any) -> str:

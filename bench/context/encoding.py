@@ -79,11 +79,14 @@ def find_reverse_edges(neighbours: Indices, present: Floats) -> Indices:
 
 def find_nearest_keypoints(keypoints: Floats, neighbours: int) -> tuple[Indices, Floats]:
     """Return the k nearest other keypoints of each, and 1 for those that exist, else 0. (N, 2) -> (N, k), (N, k) float32"""
-    from sklearn.neighbors import NearestNeighbors
+    from scipy.spatial import KDTree
 
     count = len(keypoints)
     available = min(neighbours, count - 1)
     nearest = np.zeros((count, neighbours), dtype=np.int64)
     if available > 0:
-        nearest[:, :available] = NearestNeighbors(n_neighbors=available).fit(keypoints).kneighbors(return_distance=False)
+        indices = KDTree(keypoints).query(keypoints, available + 1)[1]
+        own = indices == np.arange(count)[:, None]
+        own[~own.any(axis=1), -1] = True  # among more coincident keypoints than neighbours, its own may be missing
+        nearest[:, :available] = indices[~own].reshape(count, available)
     return nearest, np.repeat((np.arange(neighbours) < available)[None], count, axis=0).astype(np.float32)

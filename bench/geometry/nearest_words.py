@@ -39,9 +39,13 @@ class WordIndex:
         device = pick_device()
         self._dtype = pick_dtype(device)
         self._words = words
-        exact = torch.from_numpy(unit_rows(words))
-        self._coarse = exact.to(device, self._dtype)  # (K, D)
-        self._error = float(rounding(exact, self._coarse).max())
+        self._coarse = torch.empty(words.shape, dtype=self._dtype, device=device)  # (K, D)
+        self._error = 0.0
+        for start in range(0, len(words), BLOCK):  # in float64, all words would take sixteen times their memory
+            exact = torch.from_numpy(unit_rows(words[start : start + BLOCK]))
+            coarse = self._coarse[start : start + BLOCK]
+            coarse.copy_(exact)
+            self._error = max(self._error, float(rounding(exact, coarse).max()))
 
     def find_nearest(self, queries: Bytes | Floats, progress: Callable[[int], object] = lambda done: None) -> Indices:
         """Return for each query the index of the word of greatest cosine, ties to the lowest index.
@@ -73,7 +77,9 @@ class WordIndex:
         import torch
 
         blocks = self._coarse.split(BLOCK)
-        tops = torch.stack([block_maxima(queries, block) for block in blocks], dim=1).float()  # (n, blocks)
+        tops = torch.empty((len(queries), len(blocks)), device=queries.device)
+        for number, block in enumerate(blocks):  # a list of small tensors between the large ones would fragment the memory
+            tops[:, number] = block_maxima(queries, block)
         best = tops.amax(dim=1)
         least = best - margin(best, errors, self._dtype)  # (n,)
         rows, words = [], []

@@ -10,15 +10,17 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import singledispatch
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from bench.api import Defense
 from bench.settings import Between, OneOf
 from bench.types import Descriptors, Floats, Release, Subspaces, WordSets
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
 
 CELL = 4  # pixels: the side of a grid cell, to which keypoints are scattered
 DIRECTIONS = 16  # number of fixed directions that are projected onto subspaces
@@ -141,6 +143,8 @@ def encode(releases: list[Release], settings: list[Floats], slots: int, encoding
     ValueError
         if a release has more candidates per keypoint than `slots`.
     """
+    import torch
+
     width, height = releases[0].size
     values, coordinates, image = [], [], []
     for number, (release, condition) in enumerate(zip(releases, settings, strict=True)):

@@ -16,6 +16,7 @@ from bench.codebook.public import Public
 from bench.core.errors import UserError
 from bench.formats import tensor_file
 from bench.formats.network_file import NetworkFile, build_module
+from bench.inversion.encoding import Encoding
 from bench.registry import fields, spec
 from bench.settings import Between, OneOf
 from bench.types import Floats
@@ -111,8 +112,6 @@ def _load(path: Path, version: object) -> Network:
 
 def _are_metadata(meta: dict[str, Any]) -> bool:
     """Return whether the required metadata have their types."""
-    from bench.inversion.encoding import Encoding  # it imports PyTorch
-
     others = meta.get("others", [])
     if not isinstance(others, list) or not all(isinstance(other, dict) for other in others):
         return False

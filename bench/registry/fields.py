@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from pathlib import Path
 from types import NoneType, UnionType
@@ -12,10 +13,12 @@ from bench.api import Plugin
 from bench.core.exact import Exact
 from bench.settings import Asset
 
+_get_hints = functools.cache(get_type_hints)  # one list of the plugins needs them hundreds of times
+
 
 def resolve_types(plugin: type[Plugin]) -> dict[str, Any]:
     """Return field name -> type, in the order of the fields."""
-    hints = get_type_hints(plugin)
+    hints = _get_hints(plugin)  # type: ignore[arg-type]
     return {field.name: hints[field.name] for field in dataclasses.fields(plugin)}  # type: ignore[arg-type]
 
 

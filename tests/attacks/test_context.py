@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as nnf
+from sklearn.neighbors import NearestNeighbors
 from train_word_attackers import Stage, fit
 
 from attacks.context import Context
@@ -240,6 +241,19 @@ def test_nearest_keypoints(rng):
     assert np.array_equal(np.sort(near[:, :2], axis=1), [[1, 2], [0, 2], [0, 1]])
     assert np.array_equal(present, [[1, 1, 0, 0, 0]] * 3)
     assert not find_nearest_keypoints(keypoints[:1], 5)[1].any()
+
+
+def test_no_keypoint_is_its_own_neighbour_among_coincident_ones():
+    keypoints = np.repeat(np.float32([[1, 1], [9, 9]]), 8, axis=0)
+    near, _ = find_nearest_keypoints(keypoints, 3)
+    assert (near != np.arange(16)[:, None]).all()
+    assert np.array_equal(keypoints[near], np.repeat(keypoints[:, None], 3, axis=1))
+
+
+def test_nearest_keypoints_are_those_of_scikit_learn(rng):
+    keypoints = rng.uniform(0, 256, (700, 2)).astype(np.float32)
+    reference = NearestNeighbors(n_neighbors=20).fit(keypoints).kneighbors(return_distance=False)
+    assert np.array_equal(find_nearest_keypoints(keypoints, 20)[0], reference)
 
 
 def test_releases_in_one_graph_are_independent(trained):

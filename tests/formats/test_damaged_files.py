@@ -13,6 +13,7 @@ import h5py
 import numpy as np
 import pycolmap
 import pytest
+from effort import EFFORT
 from fakes import draw_texture
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -28,7 +29,7 @@ from bench.testing import check_extractor
 SIDE = 256  # pixels
 COUNT = 12  # keypoints
 END = timedelta(seconds=20)  # of one example: far beyond any of them, so that only an endless one fails
-few = settings(derandomize=True, database=None, max_examples=100, deadline=END)
+few = settings(derandomize=EFFORT == 1, database=None, max_examples=100 * EFFORT, deadline=END)
 
 INTERESTING = [b"\xff" * 8, b"\0" * 8, b"9" * 40, b" ", b"\n", b"\xef\xbb\xbf", b"nan", b"-", b"#", b"\x7f" + b"\xff" * 7]
 EDITS = st.lists(

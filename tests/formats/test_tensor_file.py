@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from effort import EFFORT
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from safetensors import safe_open
@@ -81,7 +82,7 @@ def test_every_flipped_bit_of_a_file_is_found(folder: Path) -> None:
     assert same < 100
 
 
-@settings(max_examples=300, deadline=None, derandomize=True)
+@settings(max_examples=300 * EFFORT, deadline=None, derandomize=EFFORT == 1)
 @given(cut=st.integers(0, 700), added=st.binary(max_size=16), at=st.integers(0, 700))
 def test_any_truncation_and_insertion_is_refused(folder: Path, cut: int, added: bytes, at: int) -> None:
     whole = (folder / "whole").read_bytes()
@@ -105,7 +106,7 @@ METADATA = st.dictionaries(
 )
 
 
-@settings(max_examples=300, deadline=None, derandomize=True)
+@settings(max_examples=300 * EFFORT, deadline=None, derandomize=EFFORT == 1)
 @given(
     header=HEADERS | st.fixed_dictionaries({"__metadata__": METADATA, "words": TENSORS}) | st.binary(max_size=30),
     size=st.integers(0, 64),

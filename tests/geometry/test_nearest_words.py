@@ -1,6 +1,7 @@
 """The exact search for the nearest word, against brute force in float64 and against faiss."""
 
 import timeit
+import tracemalloc
 
 import faiss
 import numpy as np
@@ -73,6 +74,15 @@ def test_a_longer_multiple_is_the_same_direction():
     query = np.zeros((1, 128), dtype=np.float32)
     query[0, 0] = 3.5
     assert nearest_rows(query, words)[0] == 0
+
+
+def test_memory_of_building_does_not_grow_with_the_words():
+    words = np.ones((50_000, 128), dtype=np.uint8)
+    tracemalloc.start()
+    WordIndex(words)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < words.nbytes * 2  # all words in float64 at once would be eight times theirs
 
 
 def test_no_queries(words):

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from effort import EFFORT
 from fabricated import DIA, baselines, ldp, localizations, reconstructions
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
@@ -69,7 +70,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-@settings(max_examples=100, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=100 * EFFORT, deadline=None, derandomize=EFFORT == 1, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(data=st.data())
 def test_a_changed_record_is_refused_or_shown(folder: Path, data: st.DataObject) -> None:
     number = data.draw(st.integers(0, len(WHOLE) - 1))
@@ -105,7 +108,7 @@ def test_the_unchanged_records_are_shown(folder: Path) -> None:
     show(comparison.load_records(folder / FILE))
 
 
-@settings(max_examples=300, deadline=None, derandomize=True)
+@settings(max_examples=300 * EFFORT, deadline=None, derandomize=EFFORT == 1)
 @given(st.binary(max_size=40) | st.text(alphabet='{}[]":,0123456789.eE-naIfty\\ud8', max_size=40).map(str.encode))
 @example(b"[" * 100_000)
 @example(b'{"a":' * 100_000 + b"1" + b"}" * 100_000)

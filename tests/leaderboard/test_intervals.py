@@ -123,10 +123,12 @@ def test_without_correction_chance_decides_too_often(rng: np.random.Generator) -
     assert np.mean([min(family) <= 0.05 for family in families]) > 0.3
 
 
-def test_fractions_have_wilsons_interval() -> None:
-    expected = stats.binomtest(7, 10).proportion_ci(0.95, "wilson")
-    ours = proportion([1.0] * 7 + [0.0] * 3, 100.0)
-    assert (ours.mean, ours.low, ours.high) == pytest.approx((70.0, 100 * expected.low, 100 * expected.high))
+@pytest.mark.parametrize(("hits", "count"), [(7, 10), (0, 5), (5, 5), (1, 3000)])
+def test_fractions_have_wilsons_interval(hits: int, count: int) -> None:
+    expected = stats.binomtest(hits, count).proportion_ci(0.95, "wilson")
+    ours = proportion([1.0] * hits + [0.0] * (count - hits), 100.0)
+    assert ours.mean == pytest.approx(100 * hits / count)
+    assert (ours.low, ours.high) == (100 * expected.low, 100 * expected.high)
 
 
 @pytest.mark.parametrize("ties", [False, True])

@@ -251,7 +251,8 @@ def test_annotations_are_escaped(folders: tuple[Path, Path], capfd: pytest.Captu
 def timed(path: Path, **minutes: float) -> Path:
     names = {"bare": "test_speed_of_the_bare_product[float32]", "search": "test_speed_of_the_search"}
     rows = [{"group": "nearest word", "name": names[name], "stats": {"min": time}} for name, time in minutes.items()]
-    path.write_text(json.dumps({"benchmarks": [*rows, {"group": None, "name": "test_alone", "stats": {"min": 1.0}}]}))
+    alone = {"group": None, "name": "test_alone", "stats": {"min": 1.0}}
+    path.write_text(json.dumps({"machine_info": {"instruction_set": "A"}, "benchmarks": [*rows, alone]}))
     return path
 
 
@@ -259,7 +260,7 @@ def test_speed_is_compared_as_ratios(tmp_path: Path, capfd: pytest.CaptureFixtur
     good = speed.compute_ratios(timed(tmp_path / "good.json", bare=1.0, search=1.5))
     assert good == {"nearest word: test_speed_of_the_search": 1.5}
     baseline = tmp_path / "speed.json"
-    baseline.write_text(json.dumps(good))
+    baseline.write_text(json.dumps({"A": good, "B": {name: ratio / 9 for name, ratio in good.items()}}))
     slow_machine = timed(tmp_path / "slow.json", bare=10.0, search=16.0)
     slow_code = timed(tmp_path / "worse.json", bare=1.0, search=3.2)
     assert cli.main(["check", "--baseline", str(baseline), "--results", str(slow_machine)]) == 0
@@ -267,7 +268,17 @@ def test_speed_is_compared_as_ratios(tmp_path: Path, capfd: pytest.CaptureFixtur
     assert "nearest word" in capfd.readouterr().out
 
 
-@pytest.mark.parametrize("content", ["[]", "{", '{"a": "b"}'])
+def test_ratios_of_an_unknown_instruction_set_are_reported(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    results, baseline = timed(tmp_path / "slow.json", bare=1.0, search=99.0), tmp_path / "speed.json"
+    baseline.write_text(json.dumps({"B": {"nearest word: test_speed_of_the_search": 1.5}}))
+    assert cli.main(["check", "--baseline", str(baseline), "--results", str(results)]) == 0
+    out, err = capfd.readouterr()
+    assert "new" in out
+    assert "99" in out
+    assert "no ratios for the instruction set A, only for: B" in err
+
+
+@pytest.mark.parametrize("content", ["[]", "{", '{"a": "b"}', '{"a": {"b": "c"}}'])
 def test_wrong_files_of_speed_are_one_line(tmp_path: Path, capfd: pytest.CaptureFixture[str], content: str) -> None:
     (tmp_path / "speed.json").write_text(content)
     assert cli.main(["check", "--baseline", str(tmp_path / "speed.json"), "--results", str(tmp_path / "absent.json")]) == 2

@@ -153,6 +153,16 @@ def test_recovered_counts_equal_descriptors_as_one_candidate() -> None:
     assert recovered.PLUGIN()(truth, truth) == 1.0
 
 
+def test_recovered_in_parts_equals_all_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(3)
+    truth = rng.normal(size=(30, 8)).astype(np.float32)
+    estimate = truth + rng.normal(size=(30, 8)).astype(np.float32)
+    at_once = recovered.PLUGIN()(truth, estimate)
+    monkeypatch.setattr(recovered, "COSINES", 7 * 30)
+    assert 0 < at_once < 1
+    assert recovered.PLUGIN()(truth, estimate) == at_once
+
+
 def test_recovered_chance_level() -> None:
     """A constant guess gives exactly 1 / N; independent guesses give it on average."""
     rng = np.random.default_rng(0)

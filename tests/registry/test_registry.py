@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from fakes import FAKES, install_plugins
+from PIL import Image
 
 from bench.api import Attack, Defense, Metric, Privacy
 from bench.codebook.public import Public
@@ -128,6 +129,16 @@ def test_attack_must_not_override_applicability() -> None:
         discovery.check(discovery.ATTACK, wrong)
 
 
+HEAVY = {"torch", "cv2", "pandas", "matplotlib", "skimage", "h5py", "scipy", "sklearn", "faiss", "pycolmap", "poselib", "dask"}
+
+
+def list_heavy_imports(code: str) -> set[str]:
+    """Return the heavy libraries that a process which executes `code` imports."""
+    script = f"import sys\n{code}\nprint(*{HEAVY} & set(sys.modules), *{{'scipy.stats'}} & set(sys.modules), file=sys.stderr)"
+    done = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True)
+    return set(done.stderr.splitlines()[-1].split())
+
+
 @pytest.mark.parametrize(
     "code",
     [
@@ -137,6 +148,19 @@ def test_attack_must_not_override_applicability() -> None:
     ],
 )
 def test_heavy_libraries_are_not_imported_early(code: str) -> None:
-    heavy = "{'torch', 'cv2', 'pandas', 'matplotlib', 'skimage', 'h5py'}"
-    script = f"import sys\n{code}\nimported = {heavy} & set(sys.modules)\nassert not imported, imported"
-    subprocess.run([sys.executable, "-c", script], check=True, capture_output=True)
+    assert list_heavy_imports(code) == set()
+
+
+@pytest.mark.slow
+def test_list_imports_no_heavy_library_but_opencv() -> None:
+    assert list_heavy_imports("from bench.cli import main\nmain(['list'])") == {"cv2"}  # of the gallery's module
+
+
+@pytest.mark.slow
+def test_main_job_imports_only_what_it_uses(tmp_path: Path) -> None:
+    image = np.random.default_rng(0).integers(0, 256, (64, 64, 3), dtype=np.uint8)
+    (tmp_path / "photos").mkdir()
+    Image.fromarray(image).save(tmp_path / "photos" / "one.png")
+    job = ["run", "--defense", "ldp", "--attack", "dia", "--images", str(tmp_path / "photos"), "--out", str(tmp_path / "out")]
+    used = {"torch", "cv2", "matplotlib", "skimage", "scipy"}
+    assert list_heavy_imports(f"from bench.cli import main\nassert main({job}) == 0") == used

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from bench.cli.terminal import DONE, FAILED, REGRESSION, print_rich
+from bench.cli.terminal import DONE, FAILED, REGRESSION, print_rich, print_status
 
 SUMMARY = "compare results with a baseline, experiment by experiment: better, worse, or unchanged"
 EPILOG = """Experiments are matched by configuration and inputs; seeds may differ. The tolerance comes from the spread between
@@ -38,7 +38,11 @@ def execute(args: argparse.Namespace) -> int:
     from leaderboard import regression, regression_report, speed
 
     if args.baseline.suffix == ".json":
-        found = speed.compare(speed.load_ratios(args.baseline), speed.compute_ratios(args.results))
+        baselines, instructions = speed.load_ratios(args.baseline), speed.read_instruction_set(args.results)
+        found = speed.compare(baselines.get(instructions, {}), speed.compute_ratios(args.results))
+        if instructions not in baselines:
+            known = ", ".join(baselines) or "none"
+            print_status(DONE, f"{args.baseline}: no ratios for the instruction set {instructions}, only for: {known}")
     else:
         both = [records.read(records.find_file(path)).records for path in (args.baseline, args.results)]
         found = regression.compare(*both)
