@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import get_args
+from typing import Final, get_args
 
 from bench.cli.terminal import DONE, FAILED, add_extractor, add_seed, print_status
 from bench.core.errors import UserError
@@ -25,7 +25,7 @@ examples:
   bench export --dataset colmap:path=gallery/ --layout hloc --out features.h5 --model model/
 """
 REQUIRED = ("layout", "out")
-CAMERA_MODE = "per_image"
+CAMERA_MODE: Final = "per_image"
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
