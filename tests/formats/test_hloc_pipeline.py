@@ -93,7 +93,7 @@ def match(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     distances = 2 - 2 * one @ other.T  # squared
 
     def find(rows: np.ndarray) -> np.ndarray:
-        nearest = np.argsort(rows, axis=1)[:, :2]
+        nearest = np.argpartition(rows, (0, 1), axis=1)[:, :2]
         first, second = np.take_along_axis(rows, nearest, axis=1).T
         return np.where(first <= RATIO**2 * second, nearest[:, 0], -1)
 
