@@ -9,7 +9,9 @@ images. The page is docs/results/exports.md.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from result_page import write_page
 
@@ -19,6 +21,7 @@ from bench.core.colmap_log import silence_colmap
 from bench.core.errors import UserError
 from bench.core.table import markdown_row
 from bench.datasets.walk import Walk
+from bench.extractors.sift import Sift
 from bench.formats import scene_export
 from bench.images.scene import Scene
 from bench.registry import discovery, spec
@@ -55,11 +58,17 @@ def main() -> None:
         row = (f"`{defense}`", f"`{attack}`" if attack else "none", *reconstruct(args.work, defense, attack))
         print(markdown_row(row), flush=True)
         rows.append(row)
-    public = Public()
-    defenses = [spec.read(defense, discovery.DEFENSE) for defense, _ in EXPORTS]
-    attacks = [spec.read(attack, discovery.ATTACK) for _, attack in EXPORTS if attack is not None]
-    used = [spec.to_json_with_digests(plugin, public) for plugin in (*defenses, *attacks)]
+    used = [entry for defense, attack in EXPORTS for entry in describe(defense, attack)]
     write_page("exports.md", TEXT + "\n".join(map(markdown_row, rows)), used)
+
+
+def describe(defense: str, attack: str | None) -> Iterator[dict[str, Any]]:
+    """Yield the configurations of a row, with the digests of their files."""
+    public, plugin = Public(), spec.read(defense, discovery.DEFENSE)
+    yield spec.to_json_with_digests(plugin, public)
+    if attack is not None:
+        attacker = spec.read(attack, discovery.ATTACK)
+        yield spec.to_json_with_digests(attacker, public, attacker.assets(plugin, Sift(), public))
 
 
 def reconstruct(work: Path, defense: str, attack: str | None) -> tuple[str, str, str, str]:

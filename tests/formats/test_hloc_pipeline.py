@@ -219,9 +219,7 @@ def test_an_exported_database_localizes_as_its_extractor(stretch: Export, tmp_pa
 @pytest.mark.exhaustive
 def test_recall_on_the_gallery_is_that_of_the_benchmark(gallery: Export, tmp_path: Path) -> None:
     model = triangulate(gallery, tmp_path / "sfm")
-    print(model.summary())
     found = find_localized(gallery, localize(gallery, model))
-    print(sum(found.values()), sum(gallery.localized.values()), len(found))
     assert compare_recalls(found.values(), gallery.localized.values()) > CHANCE
 
 
