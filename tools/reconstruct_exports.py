@@ -35,12 +35,14 @@ EXPORTS: tuple[tuple[str, str | None], ...] = (
     ("ldp", None),
     ("ldp", "context"),
     ("affine", "nearest"),
+    ("affine", "lattice"),
 )
 TEXT = f"""# Exports in COLMAP
 
 `bench export --full-images --layout colmap --camera-mode single` wrote a database of {VIEWS} views of the gallery's courtyard
 (`walk:views={VIEWS}`, 640 by 480 pixels) for each row. COLMAP matched all pairs and built a model without intrinsics and poses. A
-row without an attack holds all released descriptors: each word of a set is a keypoint of its own.
+row without an attack holds all released descriptors: each word of a set is a keypoint of its own. The
+attack `database` has no row: it recovers descriptors with negative components, which COLMAP's 8-bit databases cannot hold.
 
 """
 
