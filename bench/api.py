@@ -309,6 +309,10 @@ class Extractor(Plugin, ABC):
             if there is no keypoint.
         """
 
+    def list_notes(self, source: Source | None) -> tuple[str, ...]:
+        """Return remarks on the features of a photograph, which its record holds. `source` is as in `extract`."""
+        return ()
+
     def mirror_order(self) -> Indices | None:
         """Return the (D,) permutation of a descriptor's components in the mirrored photograph; None if there is none."""
         return None

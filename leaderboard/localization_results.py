@@ -12,12 +12,14 @@ from bench.core.errors import UserError
 from bench.datasets import aachen
 from bench.formats import lists, pairs
 from bench.runner.records import Record
+from bench.tasks.localization import THRESHOLDS
 from leaderboard import tables
 
 if TYPE_CHECKING:
     import pycolmap
 
 ESTIMATES = "estimates"
+RECALL = f"recall_{max(THRESHOLDS, key=THRESHOLDS.__getitem__)}"  # by the loosest threshold
 
 
 def write(records: Iterable[Record], out: Path) -> Iterator[str]:
@@ -58,6 +60,24 @@ def write(records: Iterable[Record], out: Path) -> Iterator[str]:
             poses = {record["sample"]: _read_pose(record) for record in experiment}
             path, missing = aachen.write_evaluation(out, method, poses)
             yield f"{path}: {len(poses) - missing} poses; {missing} queries without a pose are left out"
+
+
+def find_lost_baselines(records: Iterable[Record]) -> Iterator[str]:
+    """Yield a line for each undefended experiment in which no query is localized.
+
+    A query counts as localized if its pose is within the loosest threshold or, where the true pose is withheld, if it has a pose.
+    """
+    localized: dict[str, list[bool]] = {}
+    for record in records:
+        if record["task"] == "localization" and record["defense"]["name"] == "none" and record["status"] == "ok":
+            recall = record["metrics"].get(RECALL, _read_pose(record) is not None)
+            localized.setdefault(record["experiment_id"], []).append(bool(recall))
+    for each in localized.values():
+        if not any(each):
+            yield (
+                f"warning: without a defense, 0 of {len(each)} queries are localized, so this run says nothing about defenses; "
+                "give a dataset with more references that see the queries"
+            )
 
 
 def _name_methods(experiments: list[list[Record]]) -> list[str]:

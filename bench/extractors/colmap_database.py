@@ -21,7 +21,7 @@ import numpy as np
 
 from bench.api import Extractor
 from bench.core.errors import SampleError, UserError
-from bench.formats.stored_features import NAMES_HINT, check_name, map_into_square, read_upright_size
+from bench.formats.stored_features import NAMES_HINT, check_name, map_into_pixels, read_upright_size
 from bench.geometry.nearest_words import unit_rows
 from bench.images.photographs import Source
 from bench.types import Bytes, Features
@@ -37,7 +37,7 @@ MAX_CHECKS = 1_000  # for one photograph: seconds. A hostile database can define
 
 @dataclass(frozen=True, kw_only=True)
 class ColmapDatabase(Extractor):
-    """Reads SIFT features from a COLMAP database, and moves the keypoints into the benchmark's square."""
+    """Reads SIFT features from a COLMAP database, and moves those of photographs into the benchmark's square."""
 
     eight_bit = True
     reads_stored: ClassVar[bool] = True
@@ -60,13 +60,13 @@ class ColmapDatabase(Extractor):
             )
         keypoints, codes, size = self._read(source)
         read_upright_size(source, size)
-        side = image.shape[0]
-        xy = map_into_square(keypoints.astype(np.float64), size, side)  # (N, 2)
-        keep = ((xy >= 0) & (xy < side)).all(axis=1) & codes.any(axis=1)
+        xy, inside = map_into_pixels(keypoints.astype(np.float64), size, image)
+        keep = inside & codes.any(axis=1)
         if not keep.any():
             raise SampleError(f"{source.name}: no keypoint of {self.path} lies in the photograph's central square")
         rows = np.ascontiguousarray(codes[keep])
-        features = Features(keypoints=xy[keep].astype(np.float32), descriptors=unit_rows(rows), codes=rows, size=(side, side))
+        points, (height, width) = xy[keep].astype(np.float32), image.shape[:2]
+        features = Features(keypoints=points, descriptors=unit_rows(rows), codes=rows, size=(width, height))
         return features.by_position()
 
     def _read(self, source: Source) -> tuple[np.ndarray, Bytes, tuple[int, int]]:

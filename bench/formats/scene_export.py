@@ -74,6 +74,20 @@ def _write_colmap(scene: Scene, out: Path) -> Path:
     return out / "images"
 
 
+def write_binary_model(references: tuple[Reference, ...], folder: Path) -> None:
+    """Write the cameras and poses of references as a binary model without points, which hloc reads and COLMAP triangulates.
+
+    Raises
+    ------
+    UserError
+        if the folder exists already.
+    """
+    if folder.exists():
+        raise UserError(f"{folder}: exists already; give a new folder")
+    folder.mkdir(parents=True)
+    build_model(references).write_binary(folder)
+
+
 def build_model(images: tuple[Reference, ...]) -> pycolmap.Reconstruction:
     """Return a reconstruction of cameras and poses without points. Images with equal intrinsics share a camera.
 

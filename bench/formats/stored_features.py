@@ -1,4 +1,6 @@
-"""Coordinates of features from other programs: conversion between the stored photograph and the benchmark's square.
+"""Coordinates of features from other programs: conversion between the stored photograph and the pixels that the benchmark reads.
+
+Of a photograph the benchmark reads the central square, resized, and of an image of a scene all pixels.
 
 The name of a photograph in a file of features is its path below the other program's image folder. It is compared with the path
 below ours as given: no link is resolved, and no part of the path is left out.
@@ -25,6 +27,23 @@ def map_into_square(xy: np.ndarray, size: tuple[int, int], side: int) -> np.ndar
 def map_out_of_square(xy: np.ndarray, size: tuple[int, int], side: int) -> np.ndarray:
     """Invert `map_into_square`. (N, 2) -> (N, 2)"""
     return xy * (min(size) / side) + _find_corner(size)
+
+
+def map_into_pixels(xy: np.ndarray, size: tuple[int, int], image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Map points of a stored image of `size` (width, height) to the pixels that were read: all, or its square, resized.
+
+    Parameters
+    ----------
+    xy : (N, 2)
+    image : (H, W, 3)
+
+    Returns
+    -------
+    (N, 2) points, and (N,) whether a point lies in these pixels
+    """
+    height, width = image.shape[:2]
+    mapped = xy if (width, height) == size else map_into_square(xy, size, height)
+    return mapped, np.all((mapped >= 0) & (mapped < (width, height)), axis=1)
 
 
 def check_name(name: str) -> None:

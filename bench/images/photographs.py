@@ -2,7 +2,8 @@
 
 The rule: EXIF rotation is applied. Transparency is composited over white. A single channel is repeated three times. 16 bits are
 scaled to 8. The first page of a TIFF file is read. The largest centred square is cropped and resized with Pillow's bicubic
-filter, which averages if it shrinks.
+filter, which averages if it shrinks. JPEG files of more than 2²⁶ pixels (8192 x 8192) are decoded at half their width and height,
+which bounds the memory: 3 bytes a pixel and several copies.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from bench.types import Bytes
 
 SIDE = 256  # pixels
 MIN_SIDE = 32  # pixels
+MAX_WHOLE = 2**26  # pixels: greater JPEG files are decoded at half size
 MEGADEPTH = re.compile(r"dense\d+")  # the folder of a reconstruction; its subfolder `imgs` holds the photographs
 DEEPEST = 65535  # the greatest value of 16 bits
 SUFFIXES = {".avif", ".bmp", ".jfif", ".jpeg", ".jpg", ".png", ".ppm", ".tif", ".tiff", ".webp"}
@@ -229,8 +231,15 @@ def read(path: Path) -> Photograph:
     return Photograph(crop_square(image, SIDE), notes)
 
 
-def decode(path: Path, upright: bool = True) -> tuple[Image.Image, tuple[str, ...]]:
-    """Return an 8-bit RGB image in the size of the file, and notes on its conversion. `upright` applies EXIF rotation.
+def decode(path: Path, upright: bool = True, whole: bool = False) -> tuple[Image.Image, tuple[str, ...]]:
+    """Return an 8-bit RGB image, and notes on its conversion.
+
+    It has the size of the file, except for JPEG files of more than `MAX_WHOLE` pixels. Their decoder averages 2 x 2 pixels.
+
+    Parameters
+    ----------
+    upright : whether EXIF rotation is applied
+    whole : whether an image of any number of pixels keeps the size of the file
 
     Raises
     ------
@@ -241,6 +250,8 @@ def decode(path: Path, upright: bool = True) -> tuple[Image.Image, tuple[str, ..
         with Image.open(path) as opened:
             notes = _list_remarks(opened)
             orientation = read_orientation(opened)
+            if not whole and opened.width * opened.height > MAX_WHOLE:
+                notes += _halve(opened)
             opened.load()
             image = _rotate(opened, orientation, upright)
         image, more = _convert(image, path.name)
@@ -270,6 +281,13 @@ def read_orientation(image: Image.Image) -> int:
 def _list_remarks(image: Image.Image) -> list[str]:
     pages = getattr(image, "n_frames", 1) if image.format == "TIFF" else 1
     return [f"{pages} pages, of which the first is read"] if pages > 1 else []
+
+
+def _halve(image: Image.Image) -> list[str]:
+    """Let a JPEG file that is not loaded yet be decoded at half size. -> notes; none for other formats, which cannot"""
+    width, height = image.size
+    drafted = image.draft(None, (width // 2, height // 2))
+    return [] if drafted is None else [f"{width} x {height} pixels, decoded at half size"]
 
 
 def _rotate(image: Image.Image, orientation: int, upright: bool) -> Image.Image:

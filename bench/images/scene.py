@@ -70,7 +70,7 @@ class File(Pixels):
         return None if self.mask is None else np.asarray(self._decode(self.mask).convert("L")) > 127
 
     def _decode(self, path: Path) -> Image:
-        image, _ = decode(path, upright=False)
+        image, _ = decode(path, upright=False, whole=True)
         if image.size != self.size:
             raise SampleError(f"{path}: {image.width} x {image.height} pixels; its camera says {self.size[0]} x {self.size[1]}")
         return image

@@ -1,14 +1,15 @@
 """Export of features, releases and recovered descriptors to HDF5 files of hloc and databases of COLMAP.
 
-Keypoints refer to the photograph as stored. Each candidate of a word set becomes a keypoint of its own at the same coordinates,
-so that any matcher can match it.
+Keypoints refer to the photograph as stored, also where only its central square was read. Each candidate of a word set becomes a
+keypoint of its own at the same coordinates, so that any matcher can match it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import h5py
 import numpy as np
@@ -18,6 +19,9 @@ from bench.cache.attack_cache import recover_cached
 from bench.core.errors import SampleError, UserError
 from bench.formats.stored_features import check_name, map_out_of_square, read_upright_size
 from bench.images.photographs import Source
+from bench.images.samples import Sample
+from bench.images.scene import File
+from bench.localization.scene_index import SceneIndex
 from bench.task_api import Trial
 from bench.tasks.reconstruction import build_view
 from bench.types import Bytes, Descriptors, Floats, WordSets
@@ -27,19 +31,36 @@ NORM = 512.0  # of 8-bit SIFT, as COLMAP quantises unit vectors
 ROUNDING = 0.5 / NORM  # the greatest change of a component by quantisation
 HALF = 0.5  # hloc puts the centre of the first pixel at (0, 0)
 
+Layout = Literal["hloc", "colmap"]
+CameraMode = Literal["auto", "single", "per_folder", "per_image"]  # COLMAP's: which images of a database share a camera
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ImageFeatures:
     """Keypoints and descriptors of one photograph."""
 
     name: str  # its path below the folder of photographs
-    path: Path
+    path: Path | None  # None if it is rendered
     size: tuple[int, int]  # width, height, as stored
     keypoints: Floats  # (N, 2) pixels; the centre of the first pixel is (0.5, 0.5)
     descriptors: Floats  # (N, D) unit norm
 
 
-def collect_features(trial: Trial, path: Path, attack: Attack | None) -> ImageFeatures:
+def open_whole(sample: Sample) -> Sample:
+    """Return a photograph as a sample of the stored image, in place of its central square of 256 x 256 pixels.
+
+    Raises
+    ------
+    SampleError
+        if the photograph has an EXIF rotation, which other programs ignore, or cannot be read.
+    """
+    (source,) = sample.images
+    if not isinstance(source, Source):
+        return sample
+    return replace(sample, images=(File(path=source.path, size=read_upright_size(source), name=source.name),))
+
+
+def collect_features(trial: Trial, attack: Attack | None) -> ImageFeatures:
     """Return the descriptors that an attack recovers, or the released ones if `attack` is None.
 
     Raises
@@ -61,9 +82,33 @@ def collect_features(trial: Trial, path: Path, attack: Attack | None) -> ImageFe
         rows = release.candidates.reshape(len(keypoints), -1)  # (N m, D)
     else:
         raise SampleError(f"a release of {type(release).__name__} has no descriptors; give --attack to export recovered ones")
-    size = read_upright_size(Source(trial.sample.name, path))
-    moved = map_out_of_square(keypoints.astype(np.float64), size, release.size[0]).astype(np.float32)
-    return ImageFeatures(name=trial.sample.name, path=path, size=size, keypoints=moved, descriptors=rows)
+    (image,) = trial.sample.images
+    size = release.size
+    if isinstance(image, Source):
+        size = read_upright_size(image)
+        keypoints = map_out_of_square(keypoints.astype(np.float64), size, release.size[0]).astype(np.float32)
+    file = image if isinstance(image, Source) else image.file()
+    path = None if file is None else file.path
+    return ImageFeatures(name=trial.sample.name, path=path, size=size, keypoints=keypoints, descriptors=rows)
+
+
+def collect_references(index: SceneIndex) -> Iterator[ImageFeatures]:
+    """Yield the raw features of a scene's references, which the server holds without a defense.
+
+    Raises
+    ------
+    SampleError
+        if a reference cannot be read.
+    """
+    for image, features in zip(index.scene.references, index.reference_features, strict=True):
+        file = image.pixels.file()
+        yield ImageFeatures(
+            name=image.name,
+            path=None if file is None else file.path,
+            size=features.size,
+            keypoints=features.keypoints,
+            descriptors=features.descriptors,
+        )
 
 
 def write_hloc(images: Sequence[ImageFeatures], out: Path) -> None:
@@ -77,7 +122,7 @@ def write_hloc(images: Sequence[ImageFeatures], out: Path) -> None:
             group.create_dataset("image_size", data=np.array(image.size))
 
 
-def write_colmap(images: Sequence[ImageFeatures], out: Path) -> None:
+def write_colmap(images: Sequence[ImageFeatures], out: Path, camera_mode: CameraMode) -> None:
     """Write a database in the format of COLMAP's feature extractor, with cameras that COLMAP reads from the images.
 
     Raises
@@ -87,7 +132,7 @@ def write_colmap(images: Sequence[ImageFeatures], out: Path) -> None:
     """
     import pycolmap
 
-    root = _find_root(images)
+    root, mode = _find_root(images), pycolmap.CameraMode.__members__[camera_mode.upper()]
     for image in images:
         if image.descriptors.min(initial=0.0) < -ROUNDING:
             raise UserError(
@@ -97,7 +142,7 @@ def write_colmap(images: Sequence[ImageFeatures], out: Path) -> None:
     with pycolmap.Database.open(out):
         pass  # import_images needs an existing database
     names = [image.name for image in images]
-    pycolmap.import_images(out, root, camera_mode=pycolmap.CameraMode.PER_IMAGE, image_names=names)
+    pycolmap.import_images(out, root, camera_mode=mode, image_names=names)
     with pycolmap.Database.open(out) as database:
         numbers = {row.name: row.image_id for row in database.read_all_images()}
         unread = [name for name in names if name not in numbers]
@@ -108,10 +153,11 @@ def write_colmap(images: Sequence[ImageFeatures], out: Path) -> None:
             database.write_descriptors(numbers[image.name], pycolmap.FeatureDescriptors(kind, _quantise(image.descriptors)))
     if unread:
         out.unlink()
-        raise UserError(f"{unread[0]}: COLMAP cannot read this image; convert it to PNG or JPEG, or give --layout hloc")
-
-
-LAYOUTS: Mapping[str, Callable[[Sequence[ImageFeatures], Path], None]] = {"hloc": write_hloc, "colmap": write_colmap}
+        shared = camera_mode in ("single", "per_folder")
+        raise UserError(
+            f"{unread[0]}: COLMAP cannot read this image{', or its size is not that of its camera' if shared else ''}; "
+            f"{'give --camera-mode per_image, ' if shared else ''}convert it to PNG or JPEG, or give --layout hloc"
+        )
 
 
 def _quantise(rows: Floats) -> Bytes:
@@ -120,7 +166,10 @@ def _quantise(rows: Floats) -> Bytes:
 
 def _find_root(images: Sequence[ImageFeatures]) -> Path:
     """Return the folder that contains all images."""
-    roots = {Path(str(image.path.absolute()).removesuffix(image.name)) for image in images}
-    if len(roots) != 1 or any(not (image.path.absolute().as_posix()).endswith(image.name) for image in images):
+    paths = [image.path.absolute() for image in images if image.path is not None]
+    if len(paths) < len(images):
+        raise UserError("COLMAP needs images in files, and this dataset is rendered; write it by `bench dataset` first")
+    roots = {Path(str(path).removesuffix(image.name)) for path, image in zip(paths, images, strict=True)}
+    if len(roots) != 1 or any(not path.as_posix().endswith(image.name) for path, image in zip(paths, images, strict=True)):
         raise UserError("COLMAP needs all images in one folder; give --images")
     return roots.pop()

@@ -207,16 +207,16 @@ def _extract_image(extractor: Extractor, image: ImageSource) -> ExtractedImage:
         with wrap_plugin_errors("the reader of photographs"):
             pixels, notes = samples.read_pixels(image)
         with wrap_plugin_errors(f"plugin {extractor.name()}"):
-            features = extractor.extract(pixels, image)
+            features, remarks = extractor.extract(pixels, image), extractor.list_notes(image)
         read = functools.partial(_same, pixels)
     else:
         with wrap_plugin_errors(f"plugin {extractor.name()}"):
-            features = feature_cache.extract(extractor, image)
+            features, remarks = feature_cache.extract(extractor, image), extractor.list_notes(image.file())
         read, notes = image.read, ()
     if len(features) == 0:
         raise SampleError("no keypoint was found")
     foreground = functools.partial(samples.read_foreground, image)
-    return ExtractedImage(pixels=read, secret=features, foreground=foreground, notes=notes)
+    return ExtractedImage(pixels=read, secret=features, foreground=foreground, notes=(*notes, *remarks))
 
 
 def build_record(

@@ -2,6 +2,7 @@
 
 import builtins
 import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -10,22 +11,24 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
-from fakes import draw_texture, write_album
+from fakes import draw_texture, write_album, write_scene
 from PIL import Image
 from PIL import features as image_features
 
-from bench import cli
+from bench import cli, load_records
 from bench.codebook.examples import write_dictionary
 from bench.core.errors import SampleError, UserError
 from bench.extractors.colmap_database import ColmapDatabase
 from bench.extractors.hardnet import WEIGHTS, HardNet
 from bench.extractors.hloc import Hloc
 from bench.extractors.sift import Sift
+from bench.formats import colmap_model, scene_export
 from bench.formats import pairs as hloc_pairs
 from bench.formats.stored_features import map_into_square, map_out_of_square
 from bench.geometry.nearest_words import unit_rows
 from bench.images import photographs
 from bench.images.photographs import Source
+from bench.images.scene import File
 from bench.testing import check_extractor
 
 kornia = pytest.importorskip("kornia")
@@ -103,6 +106,11 @@ def test_invalid_arguments_of_export(images: Path, tmp_path: Path, capfd: pytest
         (("--layout", "hlco", "--out", tmp_path / "x"), "--layout hlco: unknown layout; available: hloc, colmap"),
         (("--layout", "hloc", "--out", images / "b.png"), "exists already"),
         (("--layout", "hloc", "--out", tmp_path / "x", "--attack", "nearest"), "nearest attacks Subspaces"),
+        (("--layout", "hloc", "--out", tmp_path / "x", "--dataset", "gallery"), "give --images with a folder"),
+        (("--layout", "hloc", "--out", tmp_path / "x", "--model", tmp_path / "m"), "photographs have no poses; give --dataset"),
+        (("--layout", "hloc", "--out", tmp_path / "x", "--camera-mode", "auto"), "--layout hloc has no cameras"),
+        (("--layout", "colmap", "--out", tmp_path / "x", "--camera-mode", "same"), "available: auto, single, per_folder, per_im"),
+        (("--layout", "colmap", "--out", tmp_path / "x", "--camera-mode", "single"), "or its size is not that of its camera"),
     ):
         assert export("--images", images, *arguments) == 2
         assert complaint in capfd.readouterr().err
@@ -159,6 +167,135 @@ def test_images_that_colmap_cannot_read_leave_no_database(
     assert list(tmp_path.iterdir()) == [images]
 
 
+@pytest.mark.parametrize("half", [True, False])
+def test_the_precision_that_hloc_lost_is_noted(images: Path, tmp_path: Path, half: bool) -> None:
+    out = tmp_path / "features.h5"
+    assert export("--images", images, "--layout", "hloc", "--out", out) == 0
+    source = Source("b.png", images / "b.png")
+    assert Hloc(path=out).list_notes(source) == ()
+    assert Hloc(path=out).list_notes(None) == ()
+    with h5py.File(out, "a") as opened:
+        exact = {name: opened["b.png"][name][()] for name in ("keypoints", "descriptors")}
+        for name, array in exact.items():
+            del opened["b.png"][name]
+            opened["b.png"][name] = array.astype(np.float16) if half or name == "descriptors" else array
+    (note,) = Hloc(path=out).list_notes(source)
+    assert note.startswith("b.png: hloc stored 16-bit floats, which changed ")
+    lost = {name: np.abs(array.astype(np.float16).astype(np.float64) - array) for name, array in exact.items()}
+    stated = [float(number) for number in re.findall(r"by up to (\S+)", note)]
+    if half:
+        assert lost["keypoints"].max() <= stated[0] <= 2 * lost["keypoints"].max()
+    assert len(stated) == 1 + half
+    change = np.linalg.norm(lost["descriptors"], axis=0).max()  # descriptors have norm 1
+    assert change <= stated[-1] <= 3 * change
+
+
+@pytest.mark.slow
+def test_records_hold_the_note_on_precision(images: Path, tmp_path: Path) -> None:
+    out, run = tmp_path / "features.h5", tmp_path / "run"
+    assert export("--images", images, "--layout", "hloc", "--out", out) == 0
+    with h5py.File(out, "a") as opened:
+        rows = opened["b.png"]["descriptors"][()]
+        del opened["b.png"]["descriptors"]
+        opened["b.png"]["descriptors"] = rows.astype(np.float16)
+    arguments = ["run", "--defense", "none", "--attack", "blank", "--extractor", f"hloc:path={out}", "--images", str(images)]
+    assert cli.main([*arguments, "--out", str(run)]) == 0
+    notes = {record["sample"]: record["notes"] for record in load_records(run).to_dict("records")}
+    assert any("16-bit floats" in note for note in notes["b.png"])
+    assert not any("16-bit floats" in note for note in notes["street/a.png"])
+
+
+# ---- whole images
+
+
+def test_keypoints_of_full_images_are_those_of_the_stored_pixels(images: Path, tmp_path: Path) -> None:
+    out = tmp_path / "features.h5"
+    assert export("--images", images, "--full-images", "--layout", "hloc", "--out", out) == 0
+    path = images / "street" / "a.png"
+    pixels = np.asarray(Image.open(path))
+    ours = Sift().extract(pixels)
+    with h5py.File(out) as opened:
+        group = opened["street/a.png"]
+        np.testing.assert_allclose(group["keypoints"][()], ours.keypoints - 0.5, atol=1e-5)
+        np.testing.assert_allclose(group["descriptors"][()].T, ours.descriptors, atol=1e-6)
+        assert group["image_size"][()].tolist() == [300, 200]
+    assert ours.keypoints[:, 0].min() < 50  # left of the central square
+    assert ours.keypoints[:, 0].max() > 250
+    stored = [Hloc(path=out)]
+    assert export("--images", images, "--full-images", "--layout", "colmap", "--out", tmp_path / "x.db") == 0
+    stored.append(ColmapDatabase(path=tmp_path / "x.db"))
+    for extractor in stored:  # an image of a scene is read whole, too
+        back = extractor.extract(File(path=path, size=(300, 200)).read(), Source("street/a.png", path))
+        assert back.size == (300, 200)
+        np.testing.assert_allclose(back.keypoints, ours.keypoints, atol=1e-4)
+
+
+def measure_offset(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
+    """Return the median difference of keypoints that are nearest to each other, within a pixel. (N, 2), (M, 2) -> (2,)"""
+    distances = np.linalg.norm(ours[:, None] - theirs[None], axis=2)
+    nearest = distances.argmin(axis=1)
+    close = distances.min(axis=1) < 1
+    assert close.sum() > 50
+    return np.asarray(np.median(ours[close] - theirs[nearest[close]], axis=0))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("more", [(), ("--full-images",)], ids=["square", "full"])
+def test_keypoints_agree_with_those_of_colmap(tmp_path: Path, more: tuple[str, ...]) -> None:
+    """COLMAP's own SIFT finds the same points of the stored image, without an offset of half a pixel."""
+    root = tmp_path / "photos"
+    root.mkdir()
+    draw_texture(3, (400, 256)).save(root / "a.png")
+    assert export("--images", root, *more, "--layout", "colmap", "--out", tmp_path / "ours.db") == 0
+    pycolmap.extract_features(tmp_path / "theirs.db", root, device=pycolmap.Device.cpu)
+    found = []
+    for path in (tmp_path / "ours.db", tmp_path / "theirs.db"):
+        with pycolmap.Database.open(path) as database:
+            found.append(database.read_keypoints(database.read_image_with_name("a.png").image_id)[:, :2])
+    ours, theirs = found
+    assert (ours[:, 0].max() - ours[:, 0].min() > 300) == bool(more)
+    assert np.abs(measure_offset(ours, theirs)).max() < 0.1
+    assert np.abs(measure_offset(ours - 0.5, theirs)).max() > 0.3  # the negative control: hloc's convention
+
+
+# ---- datasets and models
+
+
+def test_a_dataset_is_exported_with_its_model(tmp_path: Path) -> None:
+    """The references as a server holds them, the queries as the defense releases them, and the poses as pycolmap reads them."""
+    scene = write_scene(tmp_path / "noise", references=5, queries=4)
+    scene_export.write(scene, "colmap", tmp_path / "scene")
+    dataset, ldp = f"colmap:path={tmp_path / 'scene'}", f"ldp:epsilon=inf,subset_size=3,dictionary={write_dictionary(tmp_path)}"
+    out, model = tmp_path / "features.h5", tmp_path / "model"
+    assert export("--dataset", dataset, "--defense", ldp, "--layout", "hloc", "--out", out, "--model", model) == 0
+    with h5py.File(out) as opened:
+        for image in (*scene.references, *scene.queries):
+            raw = Sift().extract(image.pixels.read())
+            xy = opened[image.name]["keypoints"][()]
+            copies = 1 if image in scene.references else 3
+            np.testing.assert_allclose(xy[::copies], raw.keypoints - 0.5, atol=1e-5)
+            assert len(xy) == copies * len(raw)
+    found = pycolmap.Reconstruction(model)  # COLMAP's reader
+    assert (found.num_points3D(), found.num_reg_images()) == (0, 5)
+    posed = {image.name: image for image in found.images.values()}
+    ours = colmap_model.read(model)
+    assert posed.keys() == ours.keys() == {reference.name for reference in scene.references}
+    for reference in scene.references:
+        image = posed[reference.name]
+        assert image.camera.model == reference.camera.model
+        assert np.array_equal(image.camera.params, reference.camera.params)
+        assert np.array_equal(image.cam_from_world().matrix(), reference.cam_from_world.matrix())
+        assert np.array_equal(ours[reference.name][2].matrix(), reference.cam_from_world.matrix())
+    assert export("--dataset", dataset, "--layout", "hloc", "--out", tmp_path / "again.h5", "--model", model) == 2
+
+
+@pytest.mark.slow
+def test_rendered_images_are_no_files_for_colmap(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    small = "gallery:views=1,queries=1,rooms=1,width=64,height=48,detail=0.1"
+    assert export("--dataset", small, "--layout", "colmap", "--out", tmp_path / "x.db") == 2
+    assert "this dataset is rendered; write it by `bench dataset` first" in capfd.readouterr().err
+
+
 # ---- COLMAP
 
 
@@ -181,6 +318,30 @@ def test_exported_database_is_read_by_colmap_and_by_us(images: Path, tmp_path: P
     assert ours.codes is not None
     np.testing.assert_allclose(back.codes.astype(int), ours.codes.astype(int), atol=2)  # SIFT's norm is 512 but for rounding
     check_extractor(ColmapDatabase(path=out), pixels, Source("street/a.png", path))
+
+
+def list_cameras(path: Path) -> set[frozenset[str]]:
+    """Return the names of the images that share a camera, for each camera of a database."""
+    with pycolmap.Database.open(path) as database:
+        images = database.read_all_images()
+    return {frozenset(image.name for image in images if image.camera_id == camera) for camera in {i.camera_id for i in images}}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("mode", "count"), [("auto", 3), ("single", 1), ("per_folder", 2), ("per_image", 3), (None, 3)])
+def test_cameras_are_shared_as_by_colmap(tmp_path: Path, mode: str | None, count: int) -> None:
+    """COLMAP's feature extractor, which reads its cameras by itself, gives the reference."""
+    root = tmp_path / "photos"
+    for number, name in enumerate(("a/1.png", "a/2.png", "b/3.png")):
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        draw_texture(number, (300, 200)).save(root / name)
+    more = () if mode is None else ("--camera-mode", mode)
+    assert export("--images", root, "--layout", "colmap", "--out", tmp_path / "ours.db", *more) == 0
+    reference = pycolmap.CameraMode.__members__[(mode or "per_image").upper()]
+    pycolmap.extract_features(tmp_path / "theirs.db", root, camera_mode=reference, device=pycolmap.Device.cpu)
+    ours = list_cameras(tmp_path / "ours.db")
+    assert ours == list_cameras(tmp_path / "theirs.db")
+    assert len(ours) == count
 
 
 @pytest.mark.parametrize("sign", [1, -1])

@@ -3,6 +3,8 @@
 import logging
 import os
 import struct
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -274,3 +276,47 @@ def test_validation_set(tmp_path: Path) -> None:
         photographs.split_validation(sources, names)
     with pytest.raises(UserError, match="no such folder or file"):
         photographs.split_validation(sources, tmp_path / "absent")
+
+
+# ---- great JPEG files
+
+
+def test_jpeg_files_above_the_bound_are_decoded_at_half_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The square changes by less than JPEG's own loss. At the bound and in other formats, no pixel changes."""
+    picture = draw_texture(0, (1201, 900))
+    for name in ("a.jpg", "a.png"):
+        picture.save(tmp_path / name)
+    before = {name: photographs.read(tmp_path / name) for name in ("a.jpg", "a.png")}
+    monkeypatch.setattr(photographs, "MAX_WHOLE", 1201 * 900)
+    assert np.array_equal(photographs.read(tmp_path / "a.jpg").pixels, before["a.jpg"].pixels)
+    monkeypatch.setattr(photographs, "MAX_WHOLE", 1201 * 900 - 1)
+    halved = photographs.read(tmp_path / "a.jpg")
+    assert halved.notes == ("a.jpg: 1201 x 900 pixels, decoded at half size",)
+    assert photographs.decode(tmp_path / "a.jpg")[0].size == (601, 450)
+    change = np.abs(halved.pixels.astype(int) - before["a.jpg"].pixels)
+    assert change.any()
+    assert change.mean() < np.abs(before["a.png"].pixels.astype(int) - before["a.jpg"].pixels).mean()
+    assert photographs.decode(tmp_path / "a.jpg", whole=True)[0].size == (1201, 900)
+    assert np.array_equal(photographs.read(tmp_path / "a.png").pixels, before["a.png"].pixels)
+    assert photographs.read(tmp_path / "a.png").notes == ()
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    picture.save(tmp_path / "turned.jpg", exif=exif)
+    assert photographs.decode(tmp_path / "turned.jpg")[0].size == (450, 601)
+
+
+MEASURE = """import resource, sys
+from bench.images import photographs
+photographs.MAX_WHOLE *= int(sys.argv[2])
+photographs.read(photographs.Path(sys.argv[1]))
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="the unit of the peak of memory is Linux's")
+def test_memory_of_a_great_jpeg_file(tmp_path: Path) -> None:
+    Image.new("RGB", (12_000, 9_000), "gray").save(tmp_path / "a.jpg")
+    command = [sys.executable, "-W", "ignore", "-c", MEASURE, str(tmp_path / "a.jpg")]
+    halved, whole = (int(subprocess.check_output([*command, factor])) for factor in ("1", "2"))
+    assert halved < 600 < whole  # megabytes; the second is the negative control

@@ -168,6 +168,30 @@ def test_random_dictionaries_localize_if_both_sides_share_them(dataset: Path, tm
     assert mean(run(dataset, few)) <= 0.4
 
 
+def test_a_baseline_that_localizes_nothing_is_named(
+    dataset: Path, raw: list[Record], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """The server is given one reference of another query, so it has no match for any query."""
+    other = tmp_path / "pairs.txt"
+    other.write_text(f"elsewhere.png {aachen.load(dataset).references[0].name}\n")
+    warning = "warning: without a defense, 0 of 5 queries are localized"
+    task, out = f"localization:pairs={other}", str(tmp_path / "run")
+    arguments = ["run", "--task", task, "--dataset", f"aachen:path={dataset}", "--extractor", "sift:max_keypoints=400"]
+    assert cli.main([*arguments, "--defense", "none", "--out", out]) == 0
+    assert capfd.readouterr().err.count(warning) == 1
+    assert list(localization_results.find_lost_baselines(raw)) == []
+    lost = [{**record, "metrics": record["metrics"] | {"recall_5m_10deg": 0.0}} for record in raw]
+    (line,) = localization_results.find_lost_baselines(lost)
+    assert line.startswith(warning)
+    assert list(localization_results.find_lost_baselines([*lost[1:], raw[0]])) == []  # one query is enough
+    defended = [{**record, "defense": {"name": "ldp"}} for record in lost]
+    assert list(localization_results.find_lost_baselines(defended)) == []
+    # Where the true poses are withheld, any pose counts.
+    withheld = [{**record, "metrics": {}} for record in raw]
+    assert list(localization_results.find_lost_baselines(withheld)) == []
+    assert len(list(localization_results.find_lost_baselines([{**each, "estimates": {"pose": None}} for each in withheld]))) == 1
+
+
 # ---- exported files
 
 

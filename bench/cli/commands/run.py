@@ -85,6 +85,8 @@ def execute(args: argparse.Namespace) -> int:
     _print_records(records) if args.json else watch.print_tables(records)
     for line in localization_results.write(records, out):
         print_status(DONE, line)
+    for line in localization_results.find_lost_baselines(records):
+        print_status(DONE, line)
     print_status(DONE, f"written to {out}")
     return FAILED if any(record["status"] == "failed" for record in records) else DONE
 
