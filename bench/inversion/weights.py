@@ -189,6 +189,8 @@ def explain_incompatible(meta: dict[str, Any], defense: Defense, extractor: Extr
     """Return the reason why a network does not suit the releases of `defense`; None if it was trained for them."""
     if meta["defense"]["name"] != defense.name():
         return f"trained for {meta['defense']['name']}"
+    if meta["extractor"]["name"] != extractor.name():  # a dictionary of other features follows from it
+        return explain_other_features(meta, extractor, public)
     configuration = spec.to_json_with_digests(defense, public)
     for field, text in meta["serves"].items():
         if getattr(defense, field) not in _decode_setting(text):
