@@ -28,6 +28,7 @@ KIND = "dictionary"
 SIFT = 128  # length of 8-bit words
 NORM = 512.0  # of SIFT's 8-bit vectors
 SIGNED_NORM = 2048.0  # of signed words; rounding turns them by about a thousandth of a radian
+MAX_NEGATIVE = 0.01  # greatest fraction of the squared norm in negative components of descriptors with 8-bit words: noise
 EXACT = 2**24  # squared norms below this give exact dot products in float32
 
 
@@ -81,7 +82,8 @@ class Dictionary:
         hint = "build one for this extractor with `bench dictionary build`"
         if rows.shape[1] != self.words.shape[1]:
             raise UserError(f"the descriptors have length {rows.shape[1]}, the words of {asset} {self.words.shape[1]}; {hint}")
-        if self.words.dtype == np.uint8 and (rows < 0).any():
+        negative = np.square(np.minimum(rows, 0, dtype=np.float64)).sum()  # of learned features about half of the total
+        if self.words.dtype == np.uint8 and negative > MAX_NEGATIVE * np.square(rows, dtype=np.float64).sum():
             raise UserError(f"the descriptors have negative components, the words of {asset} are 8-bit vectors of SIFT; {hint}")
 
     def sub_database(self, index: int, count: int) -> Words:
