@@ -1,6 +1,7 @@
 """XFeat, ALIKED and DISK: the upstream implementations, the convention of keypoints, weights, and images without keypoints."""
 
 import dataclasses
+import shutil
 import socket
 import sys
 from collections.abc import Callable
@@ -15,6 +16,7 @@ import skimage.data
 import torch
 from scipy.spatial import KDTree
 
+from bench import cli, load_records
 from bench.api import Extractor
 from bench.core.errors import SampleError, UserError
 from bench.extractors import aliked, disk, xfeat
@@ -22,6 +24,7 @@ from bench.extractors.aliked import Aliked
 from bench.extractors.disk import Disk
 from bench.extractors.xfeat import XFeat
 from bench.formats import pretrained
+from bench.images.photographs import list_builtin
 from bench.types import Features, Floats
 
 pytest.importorskip("kornia.feature")
@@ -178,6 +181,40 @@ def test_the_strongest_keypoints_are_selected(plugin: type[Extractor], given: di
 def test_images_without_keypoints(plugin: type[Extractor], given: dict[str, Any], image: np.ndarray) -> None:
     with pytest.raises(SampleError, match=r"no keypoint|at most 16 pixels"):
         build(plugin, given).extract(image)
+
+
+# ---- a dictionary, a training and a run
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("spec", ["xfeat", pytest.param("aliked:variant=t16", marks=pytest.mark.exhaustive)])
+def test_dictionary_network_and_run(spec: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    build(XFeat, {}) if spec == "xfeat" else build(Aliked, {})
+    builtin = list_builtin()
+    for folder, sources in {"words": builtin[:2], "train": builtin[2:4], "unseen": builtin[4:5], "photos": builtin[5:6]}.items():
+        (tmp_path / folder).mkdir()
+        for source in sources:
+            shutil.copy(source.path, tmp_path / folder)
+
+    def run(*arguments: str) -> None:
+        assert cli.main([*arguments, "--extractor", spec]) == 0, capsys.readouterr().err
+
+    words, folder = str(tmp_path / "W.safetensors"), str(tmp_path / "train")
+    run("dictionary", "build", "--images", str(tmp_path / "words"), "--size", "200", "--out", words)
+    attacks, defenses = [], {"none": "none", "affine": f"affine:database={words}"}
+    for name, defense in defenses.items():
+        out = str(tmp_path / f"{name}.safetensors")
+        sizes = ("--steps", "1", "--batch", "1", "--widths", "8,8", "--validation", str(tmp_path / "unseen"))
+        run("train", "--defense", defense, "--images", folder, "--out", out, *sizes)
+        attacks += ["--attack", f"dia:weights={out}"]
+    attacks += ["--attack", "lattice", "--attack", "sparsity", "--attack", "database"]
+    given = [part for defense in (*defenses.values(), f"ldp:dictionary={words}") for part in ("--defense", defense)]
+    task = f"reconstruction:inverter=dia:weights={tmp_path / 'none.safetensors'}"
+    run("run", "--images", str(tmp_path / "photos"), "--task", task, *given, *attacks, "--out", str(tmp_path / "run"))
+    records = load_records(tmp_path / "run").set_index(["defense.name", "attack.name"]).sort_index()
+    assert set(records.index[records["status"] == "ok"]) == {("none", "dia"), ("affine", "dia"), ("affine", "database")}
+    assert "does not declare 8-bit descriptors" in records.loc[("affine", "lattice"), "reason"]
+    assert "attacks descriptors with exact zeros" in records.loc[("affine", "sparsity"), "reason"]
 
 
 # ---- weights
