@@ -38,7 +38,7 @@ from bench.geometry.shared_sub_database import SharedSubDatabase, compute_inters
 from bench.geometry.subspaces import Doubles, feet_and_frames, find_nearest_to_subspaces
 from bench.settings import Asset
 from bench.threat_model import OtherReleases, PublicDatabase
-from bench.types import Bytes, Floats, Indices, Subspaces
+from bench.types import Floats, Indices, Subspaces, Words
 
 BATCH = 64  # subspaces per batch
 TOUCHING = 1e-12  # lower limit of the distance of a word to D
@@ -80,7 +80,7 @@ class Clustering(DescriptorAttack):
         return select_candidates(candidates, shared)
 
 
-def build_candidates(release: Subspaces, words: Bytes, nearest: Indices, distances: Doubles, clusters: int) -> Doubles:
+def build_candidates(release: Subspaces, words: Words, nearest: Indices, distances: Doubles, clusters: int) -> Doubles:
     """Build the candidates d̂_i of each subspace from its nearest words (Step 3).
 
     Parameters

@@ -5,8 +5,8 @@ Source: not in the paper. Its clustering attack needs a database Z as well.
 Method:
 
 1. Find the other releases that share the photograph's sub-database, and all intersections of their subspaces.
-2. Two subspaces that contain the same word intersect in it, and the words of W are 8-bit vectors. So the intersections give the
-   words to the last bit. The points in two or more subspaces form the reconstructed database.
+2. Two subspaces that contain the same word intersect in it. The points of unit norm in two or more subspaces form the
+   reconstructed database. If the words of W are 8-bit vectors, as for SIFT, the intersections give them to the last bit.
 3. Continue as the database attack (the paper's Sec. 4.1). The adversarial words of a subspace are the reconstructed words in it.
    Of the |V| words next nearest to it, the |U| that are farthest from the adversarial words estimate the descriptor.
 
@@ -32,7 +32,7 @@ from bench.geometry.nearest_words import unit_rows
 from bench.geometry.shared_sub_database import find_shared_sub_database
 from bench.geometry.subspaces import feet_and_frames, find_nearest_to_subspaces
 from bench.threat_model import OtherReleases
-from bench.types import Bytes, Floats, Subspaces
+from bench.types import Floats, Subspaces, Words
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +66,7 @@ class Intersection(DescriptorAttack):
         return estimate_descriptors(release, words, adversarial, self.neighbours, self.estimators)
 
 
-def estimate_descriptors(release: Subspaces, words: Bytes, adversarial: int, neighbours: int, estimators: int) -> Floats:
+def estimate_descriptors(release: Subspaces, words: Words | Floats, adversarial: int, neighbours: int, estimators: int) -> Floats:
     """Estimate descriptors from the reconstructed words (K, D). -> (N, D)
 
     Without words, return the direction of the point of each subspace nearest to zero.

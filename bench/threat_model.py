@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
-from bench.types import Bytes, Indices, Release
+from bench.types import Indices, Release, Words
 
 if TYPE_CHECKING:
     from bench.codebook.public import Public
@@ -28,7 +28,7 @@ class DefenseDatabase(Knowledge):
 
     description = "the database W that lifting drew its adversarial descriptors from"
 
-    words: Bytes  # (W, D)
+    words: Words  # (W, D)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -37,7 +37,7 @@ class PublicDatabase(Knowledge):
 
     description = "a database Z of the attacker's own, from other photographs"
 
-    words: Bytes  # (Z, D)
+    words: Words  # (Z, D)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -29,7 +29,7 @@ from bench.core.errors import SampleError, UserError
 from bench.geometry.nearest_words import unit_rows
 from bench.mechanisms.subset import draw_distinct
 from bench.settings import Asset, Between, OneOf
-from bench.types import Bytes, Features, Floats, Indices, Points, Subspaces
+from bench.types import Features, Floats, Indices, Points, Subspaces, Words
 
 Doubles = NDArray[np.float64]
 
@@ -70,7 +70,7 @@ class Affine(Lifting):
         length = secret.descriptors.shape[1]
         if self.dim >= length:
             raise UserError(f"affine: dim must be below the descriptors' length, {length}, got {self.dim}")
-        first, words = self._draw_sub_database(length, public, rng)
+        first, words = self._draw_sub_database(secret.descriptors, public, rng)
         d = secret.descriptors.astype(np.float64)  # (N, D)
         span, indices = lift(d, words, self.adversarial, self.dim, rng)  # (N, dim, D), (N, adversarial)
         origins, bases = reparameterise(d, span, rng)
@@ -80,13 +80,12 @@ class Affine(Lifting):
     def privacy(self, public: Public) -> Privacy:
         return Privacy("none")
 
-    def _draw_sub_database(self, length: int, public: Public, rng: np.random.Generator) -> tuple[int, Bytes]:
+    def _draw_sub_database(self, descriptors: Floats, public: Public, rng: np.random.Generator) -> tuple[int, Words]:
         """Draw the sub-database of a photograph. Returns its first row in the database, and its words (S, D)."""
         if self.adversarial == 0:
-            return 0, np.empty((0, length), dtype=np.uint8)
+            return 0, np.empty((0, descriptors.shape[1]), dtype=np.uint8)
         database = public.dictionary(self.database)
-        if database.words.shape[1] != length:
-            raise UserError(f"affine: the descriptors have length {length}, the database's words {database.words.shape[1]}")
+        database.check_suits(descriptors, self.database)
         smallest = len(database) // self.sub_databases
         if smallest < self.adversarial:
             raise UserError(
@@ -97,7 +96,7 @@ class Affine(Lifting):
         return database.start(part, self.sub_databases), database.sub_database(part, self.sub_databases)
 
 
-def lift(d: Doubles, words: Bytes, adversarial: int, dim: int, rng: np.random.Generator) -> tuple[Doubles, Indices]:
+def lift(d: Doubles, words: Words, adversarial: int, dim: int, rng: np.random.Generator) -> tuple[Doubles, Indices]:
     """Draw the directions of each subspace. Returns orthonormal bases of their span, and the indices of the words.
 
     If the directions span fewer than `dim` dimensions, all of them are drawn again. An example is a word that equals the

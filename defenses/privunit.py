@@ -18,8 +18,9 @@ Choice of γ: this file spends all of ε on that quotient, and chooses the γ wi
 among all unbiased mechanisms (Asi, Feldman and Talwar, ICML 2022). The original splits ε in two. `plateau` is the analogue
 for words.
 
-Centring: descriptors are non-negative and cluster around their mean. With `centred`, u is the component of the descriptor
-orthogonal to the mean direction of a public dictionary, and n is one less. u is a function of the descriptor, so the proof holds.
+Centring: descriptors cluster around their mean, most of all non-negative ones, as those of SIFT. With `centred`, u is the
+component of the descriptor orthogonal to the mean direction of a public dictionary, and n is one less. u is a function of the
+descriptor, so the proof holds.
 
 Limits: the coin is exact, with q a multiple of 2^-64 (`bench.mechanisms.subset`). The vector is not, since a sphere has no exact
 draw. γ and the projection are doubles, with a relative error of the densities of about 1e-12. Each component is rounded to a
@@ -44,7 +45,7 @@ from bench.core.errors import UserError
 from bench.geometry.nearest_words import unit_rows
 from bench.mechanisms.subset import draw_inclusion
 from bench.settings import Asset, Between, OneOf
-from bench.types import Descriptors, Features, Points
+from bench.types import Descriptors, Features, Floats, Points
 
 Doubles = NDArray[np.float64]
 
@@ -69,13 +70,21 @@ class PrivUnit(Defense):
             raise UserError(f"privunit: epsilon must be above 0 and finite, got {self.epsilon}")
 
     def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> Descriptors:
-        mean = public.dictionary(self.dictionary).mean[None] if self.centred else None  # (1, D)
+        mean = self._load_mean(secret.descriptors, public)
         vectors = draw_near(remove_mean(secret.descriptors.astype(np.float64), mean), mean, self.epsilon, rng)
         released = unit_rows((np.rint(vectors / GRID) * GRID).astype(np.float32))
         return Descriptors(positions=Points(keypoints=secret.keypoints.copy()), size=secret.size, descriptors=released)
 
     def privacy(self, public: Public) -> Privacy:
         return Privacy("epsilon-ldp", self.epsilon)
+
+    def _load_mean(self, descriptors: Floats, public: Public) -> Doubles | None:
+        """Return the mean direction to remove, (1, D); None if it is not removed."""
+        if not self.centred:
+            return None
+        dictionary = public.dictionary(self.dictionary)
+        dictionary.check_suits(descriptors, self.dictionary)
+        return dictionary.mean[None]
 
 
 def remove_mean(rows: Doubles, mean: Doubles | None) -> Doubles:

@@ -183,9 +183,9 @@ class _LocalInputs:
         given = {}
         for name in types.keys() & configuration.keys():
             value = configuration[name]
-            if types[name] is Asset and str(value).startswith("sha256:"):
+            if types[name] in (Asset, Path) and str(value).startswith("sha256:"):
                 if value in self.assets:
-                    given[name] = self.assets[value]
+                    given[name] = types[name](self.assets[value])
             else:
                 text = str(value).lower() if value is None or isinstance(value, bool) else str(value)
                 try:

@@ -138,6 +138,8 @@ def create_features_near_words(defense: Defense, public: Public) -> Features:
     used = 0 if defense.word_count_field is None else getattr(defense, defense.word_count_field)
     words = public.dictionary(asset, used).words  # (K, D)
     aside = np.random.default_rng(0).integers(-2, 2, size=words.shape, endpoint=True)
+    if words.dtype != np.uint8:
+        return dataclasses.replace(draw_features(len(words)), descriptors=unit_rows(words + aside), codes=None)
     codes = np.clip(words + aside, 0, 255).astype(np.uint8)
     return dataclasses.replace(draw_features(len(codes)), descriptors=unit_rows(codes), codes=codes)
 

@@ -2,7 +2,8 @@
 
 The descriptors are those of every view of each photograph (`bench.images.views`). About sqrt(K) coarse clusters are built first.
 Each of them gets a number of words in proportion to its descriptors, and is then clustered separately. An iteration costs about
-4·n·sqrt(K)·D operations; brute force takes 2·n·K·D. Centroids are rounded to 8 bits at SIFT's norm of 512.
+4·n·sqrt(K)·D operations; brute force takes 2·n·K·D. Descriptors and
+centroids are rounded to words (`bench.codebook.dictionary`).
 """
 
 from __future__ import annotations
@@ -13,17 +14,16 @@ import numpy as np
 
 from bench.api import Extractor
 from bench.codebook import dictionary
-from bench.codebook.dictionary import Dictionary
+from bench.codebook.dictionary import Dictionary, encode, round_rows
 from bench.core.errors import UserError
 from bench.core.progress import Progress
 from bench.geometry.nearest_words import WordIndex, unit_rows
 from bench.images.photographs import list_photographs
 from bench.images.views import collect_views
 from bench.registry import spec
-from bench.types import Bytes, Floats
+from bench.types import Floats, Words
 
 ITERATIONS = 12
-NORM = 512.0  # of SIFT's 8-bit vectors
 SAMPLE = 20_000  # number of descriptors for the reported mean cosine
 
 
@@ -40,9 +40,7 @@ def build(images: Path, size: int, out: Path, extractor: Extractor, seed: int) -
     if size < 2:
         raise UserError(f"--size {size}: a dictionary needs at least 2 words")
     views = collect_views(list_photographs(images), extractor)
-    if any(view.features.codes is None for view in views):
-        raise UserError(f"{extractor.name()} gives no 8-bit descriptors, which a dictionary needs")
-    codes = np.concatenate([view.features.codes for view in views if view.features.codes is not None])
+    codes = np.concatenate([encode(view.features) for view in views])
     if len(codes) < size:
         raise UserError(f"--size {size}: only {len(codes)} descriptors in {images}; use fewer words or more photographs")
     rng = np.random.default_rng(seed)
@@ -58,14 +56,14 @@ def build(images: Path, size: int, out: Path, extractor: Extractor, seed: int) -
     return dictionary.save(out, words, meta)
 
 
-def mean_cosine(codes: Bytes, words: Bytes) -> float:
-    """Return the mean cosine between descriptors and their nearest words. (N, D), (K, D) uint8"""
+def mean_cosine(codes: Words, words: Words) -> float:
+    """Return the mean cosine between descriptors and their nearest words. (N, D), (K, D)"""
     nearest = WordIndex(words).find_nearest(codes)
     return float((unit_rows(codes) * unit_rows(words[nearest])).sum(axis=1).mean())
 
 
-def cluster(codes: Bytes, size: int, rng: np.random.Generator) -> Bytes:
-    """Return distinct words in random order, by spherical k-means in two levels. (n, D) uint8 -> (size, D) uint8"""
+def cluster(codes: Words, size: int, rng: np.random.Generator) -> Words:
+    """Return distinct words in random order, by spherical k-means in two levels. (n, D) -> (size, D) of the same type"""
     rows = unit_rows(codes)
     coarse = max(1, round(size**0.5))
     clusters = _assign(rows, _run_kmeans(rows, coarse, rng))
@@ -78,7 +76,7 @@ def cluster(codes: Bytes, size: int, rng: np.random.Generator) -> Bytes:
             if count:
                 centres.append(_run_kmeans(rows[cluster_rows], int(count), rng))
             progress.advance(int(count))
-    words = np.clip(np.rint(np.concatenate(centres) * NORM), 0, 255).astype(np.uint8)
+    words = round_rows(np.concatenate(centres), codes.dtype)
     return rng.permutation(_make_distinct(words, codes, rng))
 
 
@@ -116,10 +114,10 @@ def _apportion(counts: np.ndarray, size: int) -> np.ndarray:
     return np.minimum(word_counts, counts)
 
 
-def _make_distinct(words: Bytes, codes: Bytes, rng: np.random.Generator) -> Bytes:
+def _make_distinct(words: Words, codes: Words, rng: np.random.Generator) -> Words:
     """Return the words, with descriptors in place of words that rounding made zero or equal to another word."""
     size = len(words)
-    distinct = np.unique(words[words.any(axis=1)], axis=0)
+    distinct: np.ndarray = np.unique(words[words.any(axis=1)], axis=0)
     while len(distinct) < size:
         candidates = codes[rng.choice(len(codes), min(len(codes), 4 * (size - len(distinct))), replace=False)]
         grown = np.unique(np.concatenate([distinct, candidates]), axis=0)

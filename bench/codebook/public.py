@@ -103,12 +103,11 @@ class Public:
         Raises
         ------
         UserError
-            if descriptors and words differ in length.
+            if the words cannot stand for the descriptors.
         """
         chosen = self.dictionary(asset, words)
         queries = features.descriptors if features.codes is None else features.codes
-        if queries.shape[1] != chosen.words.shape[1]:
-            raise UserError(f"the descriptors have length {queries.shape[1]}, the words of {asset} {chosen.words.shape[1]}")
+        chosen.check_suits(queries, asset)
         if not self._cache_size:
             return self._quantiser(chosen, queries)
         key = hashlib.sha256(chosen.digest.encode() + str(queries.dtype).encode() + queries.tobytes()).hexdigest()

@@ -1,4 +1,7 @@
-"""Database reconstruction from releases alone: subspaces with a common word intersect in it, and it is an 8-bit vector."""
+"""Database reconstruction from releases alone: subspaces with a common word intersect in it.
+
+The words for SIFT are 8-bit vectors, which are recovered to the last bit. Others are recovered to the precision of the release.
+"""
 
 from __future__ import annotations
 
@@ -6,20 +9,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.geometry.intersections import SubspaceIntersections
-from bench.types import Bytes
+from bench.geometry.nearest_words import unit_rows
+from bench.types import Bytes, Floats
 
 Doubles = NDArray[np.float64]
 
 NORM = 512.0  # approximate norm of 8-bit descriptors
 INTEGER_TOLERANCE = 0.01  # a number this near to an integer counts as an integer; float32 releases err by 1e-4 of the last bit
+UNIT_TOLERANCE = 1e-4  # of the norm of a word, and of the distance of two equal words
 
 
-def reconstruct_database(intersections: SubspaceIntersections) -> Bytes:
-    """Return the distinct words at which subspaces intersect in one point. -> (K, D)"""
+def reconstruct_database(intersections: SubspaceIntersections) -> Bytes | Floats:
+    """Return the distinct words at which subspaces intersect in one point: 8-bit vectors, if there are any. -> (K, D)"""
     points = intersections.points[intersections.single]
     # A word has many intersections, at slightly different points.
     first = np.unique(np.rint(points * NORM), axis=0, return_index=True)[1]
-    return np.unique(find_byte_vectors(points[first]), axis=0)
+    whole = np.unique(find_byte_vectors(points[first]), axis=0)
+    return whole if len(whole) else find_normalized_points(points[first])
+
+
+def find_normalized_points(points: Doubles) -> Floats:
+    """Return the distinct points of unit norm. (P, D) -> (K, D) float32"""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import KDTree
+
+    words = points[np.abs(np.linalg.norm(points, axis=1) - 1) < UNIT_TOLERANCE]
+    if len(words) == 0:
+        return np.empty((0, points.shape[1]), dtype=np.float32)
+    pairs = KDTree(words).query_pairs(UNIT_TOLERANCE, output_type="ndarray")  # (M, 2)
+    equal = coo_array((np.ones(len(pairs), bool), pairs.T), shape=(len(words), len(words)))
+    return unit_rows(words[np.unique(connected_components(equal, directed=False)[1], return_index=True)[1]].astype(np.float32))
 
 
 def find_byte_vectors(points: Doubles) -> Bytes:

@@ -7,13 +7,15 @@ import numpy as np
 from bench.geometry.intersections import INTERSECTION_DISTANCE
 from bench.geometry.nearest_words import unit_rows
 from bench.geometry.subspaces import Doubles, project
-from bench.types import Bytes, Floats, Indices, Subspaces
+from bench.types import Floats, Indices, Subspaces, Words
 
 BATCH_WORDS = 65_536  # words per batch
 MIN_DISTANCE = 1e-12  # replaces smaller distances to D; such a word outweighs all others
 
 
-def estimate(release: Subspaces, words: Bytes, found: Indices, distances: Doubles, adversarial: int, estimators: int) -> Floats:
+def estimate(
+    release: Subspaces, words: Words | Floats, found: Indices, distances: Doubles, adversarial: int, estimators: int
+) -> Floats:
     """Return d̂ of each subspace: the mean of words near it and far from its adversarial ones, projected onto it.
 
     The adversarial words are the first words that lie in D, at most `adversarial`. If some of them are not among `words`, the

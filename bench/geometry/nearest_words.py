@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bench.core.device import pick_device, pick_dtype
-from bench.types import Bytes, Floats, Indices
+from bench.types import Floats, Indices, Words
 
 if TYPE_CHECKING:
     import torch
@@ -23,7 +23,7 @@ BATCH = 512  # queries per pass over the words
 SLACK = 1e-4  # for sums in float32 and for products of errors
 
 
-def unit_rows(rows: Bytes | Floats) -> Floats:
+def unit_rows(rows: Words | Floats) -> Floats:
     """Return each row scaled to unit norm in float64, as float32. A row of zeros stays zero. (..., D) -> (..., D)"""
     exact = rows.astype(np.float64)
     norms = np.linalg.norm(exact, axis=-1, keepdims=True)
@@ -31,9 +31,9 @@ def unit_rows(rows: Bytes | Floats) -> Floats:
 
 
 class WordIndex:
-    """A search index of (K, D) uint8 words, none of them zero."""
+    """A search index of (K, D) words, none of them zero."""
 
-    def __init__(self, words: Bytes) -> None:
+    def __init__(self, words: Words) -> None:
         import torch
 
         device = pick_device()
@@ -47,17 +47,17 @@ class WordIndex:
             coarse.copy_(exact)
             self._error = max(self._error, float(rounding(exact, coarse).max()))
 
-    def find_nearest(self, queries: Bytes | Floats, progress: Callable[[int], object] = lambda done: None) -> Indices:
+    def find_nearest(self, queries: Words | Floats, progress: Callable[[int], object] = lambda done: None) -> Indices:
         """Return for each query the index of the word of greatest cosine, ties to the lowest index.
 
         Parameters
         ----------
-        queries : (N, D) uint8 or float32, of any norm
+        queries : (N, D) words or float32, of any norm
         progress : called with the number of queries of each finished batch
 
         Returns
         -------
-        (N,) int64. Cosines are compared as dot² / |word|² in float64, in which dot products of uint8 rows are exact.
+        (N,) int64. Cosines are compared as dot² / |word|² in float64, in which dot products of words are exact.
         """
         import torch
 
@@ -91,7 +91,7 @@ class WordIndex:
                 words.append(word + number * BLOCK)
         return torch.cat(rows).cpu().numpy(), torch.cat(words).cpu().numpy()
 
-    def _decide(self, queries: Bytes | Floats, rows: np.ndarray, words: np.ndarray) -> np.ndarray:
+    def _decide(self, queries: Words | Floats, rows: np.ndarray, words: np.ndarray) -> np.ndarray:
         """Return the candidate of greatest cosine of each query. (n, D), (P,), (P,) -> (n,)"""
         exact = self._words[words].astype(np.float64)  # (P, D)
         dots = np.einsum("pd,pd->p", queries[rows].astype(np.float64), exact)

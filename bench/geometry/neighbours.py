@@ -1,7 +1,8 @@
 """Neighbours of words in the same dictionary: the nearest words, and the number of words at each level of similarity.
 
-Words are 8-bit, so their dot products are integers below 2^24, which are exact in float32 in any order of summation. The result
-for two words depends on these two alone. It does not depend on the other words of a query, the number of threads or the machine.
+Words are integers of norm below 2^12, so their dot products are integers below 2^24, which are exact in float32 in any order of
+summation. The result for two words depends on these two alone. It does not depend on the other words of a query, the number of
+threads or the machine.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.core.device import pick_device
-from bench.types import Bytes, Indices
+from bench.types import Indices, Words
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -25,9 +26,9 @@ CACHE_LIMIT = 2**26  # greatest size of a cached table of levels
 
 
 class Neighbours:
-    """An index for comparisons among (K, D) uint8 words, none of them zero."""
+    """An index for comparisons among (K, D) words, none of them zero."""
 
-    def __init__(self, words: Bytes) -> None:
+    def __init__(self, words: Words) -> None:
         import torch
 
         exact = torch.from_numpy(words.astype(np.float32))

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from bench.core.device import pick_device, pick_dtype
 from bench.geometry.nearest_words import unit_rows
-from bench.types import Bytes, Floats, Indices, Subspaces
+from bench.types import Floats, Indices, Subspaces, Words
 
 if TYPE_CHECKING:
     import torch
@@ -34,12 +34,12 @@ FAR = 1e9  # placeholder distance of a missing word
 TIE_TOLERANCE = 1e-12  # distances with a smaller difference count as equal; float64 errs by about 1e-16
 
 
-def find_nearest_to_subspaces(release: Subspaces, words: Bytes | Floats, count: int = 1) -> tuple[Indices, Doubles]:
+def find_nearest_to_subspaces(release: Subspaces, words: Words | Floats, count: int = 1) -> tuple[Indices, Doubles]:
     """Return the nearest words of each subspace, nearest first, ties to the lowest index, and their distances.
 
     Parameters
     ----------
-    words : (K, D) uint8 or float32, none zero; only their directions count, as `unit_rows` returns them
+    words : (K, D) integers or float32, none zero; only their directions count, as `unit_rows` returns them
     count : number of words per subspace; all if there are fewer
 
     Returns
@@ -65,12 +65,13 @@ def feet_and_frames(release: Subspaces) -> tuple[Doubles, Doubles]:
     return (origins - origins @ frames.transpose(0, 2, 1) @ frames)[:, 0], frames
 
 
-def guess_descriptors(release: Subspaces) -> Floats:
+def guess_descriptors(release: Subspaces, signed: bool = False) -> Floats:
     """Return the direction of each subspace's point nearest to zero, with negative components set to zero. -> (N, D) unit norm
 
-    This is the best guess of a non-negative unit descriptor from D alone.
+    This is the best guess of a non-negative unit descriptor from D alone. `signed` descriptors keep their negative components.
     """
-    cut = np.maximum(feet_and_frames(release)[0], 0.0)
+    cut = feet_and_frames(release)[0]
+    cut = cut if signed else np.maximum(cut, 0.0)
     cut[~cut.any(axis=1)] = 1.0
     return unit_rows(cut.astype(np.float32))
 
@@ -81,7 +82,7 @@ def project(release: Subspaces, points: Doubles) -> Doubles:
     return feet + (points[:, None] @ frames.transpose(0, 2, 1) @ frames)[:, 0]
 
 
-def _find_candidates(feet: Doubles, frames: Doubles, words: Bytes | Floats, count: int) -> tuple[Indices, Indices]:
+def _find_candidates(feet: Doubles, frames: Doubles, words: Words | Floats, count: int) -> tuple[Indices, Indices]:
     """Return pairs of a subspace and a word that may be near it, by subspace. (n, D), (n, dim, D), (K, D) -> (P,) twice"""
     import torch
 
@@ -165,7 +166,7 @@ def _bound_error(exact: Doubles, rounded: Doubles, dtype: torch.dtype, words: np
 
 
 def _decide(
-    feet: Doubles, frames: Doubles, words: Bytes | Floats, rows: Indices, near: Indices, count: int
+    feet: Doubles, frames: Doubles, words: Words | Floats, rows: Indices, near: Indices, count: int
 ) -> tuple[Indices, Doubles]:
     """Return the nearest candidates of each subspace. (n, D), (n, dim, D), (K, D), (P,) twice -> (n, count) twice"""
     nearest, distances = np.empty((len(feet), count), dtype=np.int64), np.empty((len(feet), count))

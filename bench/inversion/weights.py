@@ -208,6 +208,8 @@ def explain_incompatible(meta: dict[str, Any], defense: Defense, extractor: Extr
     names = list_defenses(meta)
     if defense.name() not in names:
         return f"trained for {', '.join(names)}"
+    if meta["extractor"]["name"] != extractor.name():  # a dictionary of other features follows from it
+        return explain_other_features(meta, extractor, public)
     targets = [target for target in _list_targets(meta) if target["defense"]["name"] == defense.name()]
     reasons = [_explain_other_releases(target, defense, public) for target in targets]
     if None not in reasons:

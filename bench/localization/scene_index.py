@@ -19,7 +19,7 @@ from bench.localization import covisibility, mapping, maps
 from bench.localization.maps import Map
 from bench.localization.retrieval import Bags
 from bench.registry import spec
-from bench.types import Bytes, Features, Indices
+from bench.types import Features, Indices, Words
 
 WORDS = 32_000  # of the dictionary by default
 SEED = 0  # of the clustering
@@ -90,7 +90,7 @@ class SceneIndex:
         Raises
         ------
         UserError
-            if the extractor has no 8-bit descriptors, or there are fewer descriptors than words.
+            if there are fewer descriptors than words.
         """
         size = words or WORDS
         arrays, meta = store.fetch(dictionary.KIND, [self.digest, size], lambda: self._cluster(size))
@@ -107,12 +107,7 @@ class SceneIndex:
         meta = {"extractor": spec.to_json(self.extractor), "photographs": photographs, "descriptors": len(codes), "seed": SEED}
         return {"words": words}, meta
 
-    def _collect_codes(self, extractor: Extractor) -> Bytes:
-        """Return the 8-bit descriptors of all references. -> (n, D)"""
-        all_codes = [
-            features.codes for features in feature_cache.extract_all(extractor, [image.pixels for image in self.scene.references])
-        ]
-        codes = [each for each in all_codes if each is not None]
-        if len(codes) < len(all_codes):
-            raise UserError(f"{extractor.name()} gives no 8-bit descriptors, which a dictionary of the references needs")
-        return np.concatenate(codes)
+    def _collect_codes(self, extractor: Extractor) -> Words:
+        """Return the descriptors of all references as words. -> (n, D)"""
+        images = [image.pixels for image in self.scene.references]
+        return np.concatenate([dictionary.encode(features) for features in feature_cache.extract_all(extractor, images)])

@@ -65,7 +65,9 @@ class Server:
         dictionary = self.find_dictionary(defense)
         if isinstance(release, WordSets) and release.words is not None and dictionary is not None:
             return self.scene_index.build_bags(dictionary).rank(release.words, count)
-        return self._rank_references(extract_descriptors(release), count)
+        return self._rank_references(
+            extract_descriptors(release, signed=bool((self.scene_index.map.descriptors < 0).any())), count
+        )
 
     def localize(
         self, release: Release, defense: Defense | None, references: Indices, matcher: str, trials: int, seed: int
@@ -117,8 +119,10 @@ class Server:
         return self.scene_index.build_bags(dictionary).rank(dictionary.index.find_nearest(descriptors), count)
 
 
-def extract_descriptors(release: Release) -> Floats:
+def extract_descriptors(release: Release, signed: bool) -> Floats:
     """Return the descriptors of a release, or all its candidates, or the best guess for each subspace. -> (R, D)
+
+    `signed` is whether descriptors can have negative components.
 
     Raises
     ------
@@ -130,5 +134,5 @@ def extract_descriptors(release: Release) -> Floats:
     if isinstance(release, WordSets):
         return release.candidates.reshape(-1, release.candidates.shape[2])
     if isinstance(release, Subspaces):
-        return guess_descriptors(release)
+        return guess_descriptors(release, signed)
     raise TypeError(f"{type(release).__name__} holds nothing similar to descriptors")

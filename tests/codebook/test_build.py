@@ -54,6 +54,36 @@ def test_words_are_in_random_order(dictionary_file):
     assert abs(np.diagonal(cosines, 1).mean() - cosines[np.triu_indices(500, 1)].mean()) < 0.03
 
 
+def test_signed_descriptors_give_signed_words(tmp_path):
+    rng = np.random.default_rng(0)
+    centres = unit_rows(rng.normal(size=(20, 64)).astype(np.float32))
+    rows = unit_rows(centres[rng.integers(20, size=2000)] + rng.normal(0, 0.02, (2000, 64)).astype(np.float32))
+    codes = dictionary.round_rows(rows, np.dtype(np.int16))
+    words = build.cluster(codes, 64, np.random.default_rng(1))
+    assert words.dtype == np.int16
+    assert len(np.unique(words, axis=0)) == 64
+    assert build.mean_cosine(codes, words) > 0.98 > build.mean_cosine(codes, words[:4])
+    stored = dictionary.save(tmp_path / "K.safetensors", words, {"photographs": []})
+    loaded = dictionary.load(tmp_path / "K.safetensors")
+    assert np.array_equal(loaded.words, words)
+    assert loaded.digest == stored.digest
+    # The nearest words by brute force in float64, of descriptors that were not rounded.
+    assert np.array_equal(loaded.index.find_nearest(rows), (rows.astype(float) @ unit_rows(words).astype(float).T).argmax(axis=1))
+    assert np.abs(rows - unit_rows(codes)).max() < 1 / dictionary.SIGNED_NORM
+
+
+def test_dot_products_of_signed_words_are_exact(rng):
+    """In float32, in any order of summation: the premise of `Neighbours`."""
+    rows = unit_rows(rng.normal(size=(200, 64)).astype(np.float32))
+    words = dictionary.round_rows(np.concatenate([rows, np.eye(64, dtype=np.float32)]), np.dtype(np.int16))
+    exact = words.astype(np.int64) @ words.T.astype(np.int64)
+    for order in (np.arange(64), np.arange(64)[::-1], rng.permutation(64)):
+        single = words[:, order].astype(np.float32)
+        assert np.array_equal(np.cumsum(single[:, None] * single, axis=2, dtype=np.float32)[..., -1].astype(np.int64), exact)
+    longer = (words.astype(np.int64) * 9).astype(np.float32)  # negative control
+    assert not np.array_equal((longer @ longer.T).astype(np.int64), 81 * exact)
+
+
 def test_sub_databases_partition_the_words(dictionary_file):
     parts = [dictionary_file.sub_database(index, 16) for index in range(16)]
     assert np.array_equal(np.concatenate(parts), dictionary_file.words)
@@ -119,8 +149,11 @@ def test_invalid_files(content, message, tmp_path):
 @pytest.mark.parametrize(
     ("words", "kind", "message"),
     [
-        (np.ones((4, 128), np.float32), "dictionary", "float32, expected uint8"),
+        (np.ones((4, 128), np.float32), "dictionary", "float32, expected uint8 or int16"),
         (np.ones((4, 64), np.uint8), "dictionary", r"expected \(K, 128\)"),
+        (np.ones((4, 0), np.int16), "dictionary", r"expected \(K, D\)"),
+        (np.full((4, 64), 512, np.int16), "dictionary", "a word has norm 4096, expected about 2048"),
+        (np.full((4, 64), -(2**15), np.int16), "dictionary", "a word has norm 262144, expected about 2048"),
         (np.ones((4, 128), np.uint8), "inversion-network", "holds inversion-network, not dictionary"),
     ],
 )

@@ -239,7 +239,7 @@ def test_extreme_finite_patterns_scale_without_overflow() -> None:
         ({"epsilon": -0.5}, "naive-ldp: epsilon must be at least 0, got -0.5"),
         ({"epsilon": math.nan}, "naive-ldp: epsilon must be at least 0, got nan"),
         ({"subset_size": 0}, "naive-ldp: subset_size must be at least 1, got 0"),
-        ({"element": "int8"}, "naive-ldp: element must be uint8 or float32, got int8"),
+        ({"element": "int8"}, "naive-ldp: element must be uint8, float32 or float32x64, got int8"),
     ],
 )
 def test_wrong_configuration(wrong: dict, message: str) -> None:

@@ -90,3 +90,15 @@ def test_more_photographs_reconstruct_more_words(tmp_path):
     parts = [release_features(Asset(path), 4, seed, 30) for seed in range(8)]
     counts = [len(reconstruct_database(find_intersections_within(stack_subspaces(parts[:number])))) for number in (1, 4, 8)]
     assert counts[0] < counts[1] < counts[2] <= 400
+
+
+def test_signed_words_are_reconstructed_to_the_precision_of_the_release(tmp_path):
+    database = write_dictionary(tmp_path, 24, length=64, signed=True)
+    defense = Affine(dim=4, sub_databases=1, database=database)
+    release = defense.protect(draw_features(60, 1, 64, signed=True), Public(), np.random.default_rng(1))
+    words, found = unit_rows(Public().dictionary(database).words), reconstruct_database(find_intersections_within(release))
+    nearest = np.linalg.norm(found[:, None] - words, axis=2).argmin(axis=1)
+    np.testing.assert_allclose(found, words[nearest], atol=2e-5)
+    assert 20 < len(found) == len(np.unique(nearest))  # each word once
+    alone = defense.protect(draw_features(60, 1, 64, signed=True), Public(), np.random.default_rng(1)).take(np.arange(1))
+    assert len(reconstruct_database(find_intersections_within(alone))) == 0  # negative control: nothing intersects
