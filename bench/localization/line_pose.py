@@ -1,6 +1,6 @@
 """Pose estimation with fixed intrinsics, from matches of image lines with points: P6L in LO-RANSAC, then refinement.
 
-Source: Speciale et al., "Privacy Preserving Image Queries for Camera Localization", ICCV 2019. The released line passes through the
+Source: Speciale et al., "Privacy Preserving Image Queries for Camera Localization", ICCV 2019. A released line passes through its
 hidden keypoint, so each match gives one constraint, and a pose needs six. The minimal solver is PoseLib's (Kukelova et al., CVPR
 2016), the refinement SciPy's.
 
