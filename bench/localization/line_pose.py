@@ -45,10 +45,10 @@ def estimate(lines: Doubles, xyz: Doubles, camera: pycolmap.Camera, *, trials: i
     # PoseLib's solver turns its equations by the C library's random numbers.
     ctypes.CDLL(None).srand(seed % 2**31)
     normals, scales = _find_planes(lines, camera)
-    rng, best, most, needed, made = np.random.default_rng(seed), None, 0.0, math.inf, 0
-    while made < min(trials, max(needed, MIN_TRIALS)):
-        batch = min(BATCH, trials - made)
-        made += batch
+    rng, best, most, needed, done = np.random.default_rng(seed), None, 0.0, math.inf, 0
+    while done < min(trials, max(needed, MIN_TRIALS)):
+        batch = min(BATCH, trials - done)
+        done += batch
         poses = _solve(normals, xyz, batch, rng)
         scores = _score(poses, normals, scales, xyz)  # (P,)
         if len(poses) == 0 or scores.max() <= most:
@@ -62,9 +62,9 @@ def estimate(lines: Doubles, xyz: Doubles, camera: pycolmap.Camera, *, trials: i
         return None
     best = _refine(best, lines, xyz, camera)
     inliers = compute_line_errors(best, camera, lines, xyz) < MAX_LINE_ERROR
-    if inliers.sum() < MIN_LINES or _count_false_alarms(best, camera, lines, xyz, inliers, made) > MAX_FALSE_ALARMS:
+    if inliers.sum() < MIN_LINES or _count_false_alarms(best, camera, lines, xyz, inliers, done) > MAX_FALSE_ALARMS:
         return None
-    return Estimate(cam_from_world=_to_rigid(best), inliers=inliers, trials=made)
+    return Estimate(cam_from_world=_to_rigid(best), inliers=inliers, trials=done)
 
 
 def compute_line_errors(pose: Doubles, camera: pycolmap.Camera, lines: Doubles, xyz: Doubles) -> Doubles:

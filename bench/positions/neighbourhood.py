@@ -4,10 +4,10 @@ Source: Chelani, Benbihi, Sattler, Kahl and Kukelova, "Obfuscation Based Privacy
 Neighborhood Information", 3DV 2025 (arXiv 2409.11536). Its code is not published. The idea is theirs: a keypoint lies near its
 neighbours, so it lies near its neighbours' lines. The estimators are ours.
 
-Method: the point at t of line i has the distance |t − t_ij| |sin θ_ij| to the line of neighbour j. t_ij is the crossing of the two
-lines and θ_ij their angle. The estimate minimizes the weighted sum of min(distance, `reach`) over the neighbours. The minimum of
-this sum of truncated cones is at a crossing or at an end of the line, and all of them are tried. Without truncation the estimate is
-the weighted median of the crossings.
+Method: the point at t of line i has the distance |t − t_ij| |sin θ_ij| to the line of neighbour j. t_ij is the crossing of the
+two lines and θ_ij their angle. The estimate minimizes the weighted sum of min(distance, `reach`) over the neighbours. The minimum
+of this sum of truncated cones is at a crossing or at an end of the line, and all of them are tried. Without truncation the
+estimate is the weighted median of the crossings.
 """
 
 from __future__ import annotations
