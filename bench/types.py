@@ -74,6 +74,19 @@ class Points(Positions):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Lines(Positions):
+    """One line per keypoint, which passes through it."""
+
+    lines: Floats  # (N, 3) a, b, c of {(x, y): a x + b y + c = 0} in pixels, a² + b² = 1
+
+    def __len__(self) -> int:
+        return len(self.lines)
+
+    def take(self, rows: NDArray[Any]) -> Lines:
+        return Lines(lines=self.lines[rows])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Release:
     """The data that leave the phone: positions × descriptors.
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from bench.api import Attack, Dataset, Defense, Extractor, Metric, Plugin, Privacy
+from bench.api import Attack, Dataset, Defense, Extractor, Metric, Plugin, PositionAttack, Privacy
 from bench.cache import dictionary_cache, feature_cache
 from bench.codebook.public import Public
 from bench.core import environment, hashing
@@ -124,6 +124,8 @@ def build_plan(configuration: RunConfiguration, describe: Describe = environment
         "extractor": spec.to_json_with_digests(extractor, public),
     }
     metrics = (*_default_metrics(), *configuration.metrics) if task.judges_attacks else ()
+    if not any(isinstance(attack, PositionAttack) for _, attack in configuration.pairs):
+        metrics = tuple(metric for metric in metrics if metric.compares != "positions")
     if collection.scene is None:
         metrics = tuple(metric for metric in metrics if metric.compares != "views")
     metric_settings = {metric.name(): _settings(metric) for metric in metrics}
@@ -132,7 +134,7 @@ def build_plan(configuration: RunConfiguration, describe: Describe = environment
     experiments = []
     for defense, attack in configuration.pairs:
         defense_record = spec.to_json_with_digests(defense, public)
-        reason = task.explain_not_applicable(defense, attack, extractor, public)
+        reason = _explain_hidden_positions(task, defense) or task.explain_not_applicable(defense, attack, extractor, public)
         attack_record = _attack_record(task, defense, attack, extractor, public, reason)
         experiment_id = records.experiment_id(
             spec.to_json(task), defense_record, attack_record, dataset_record, seed, metric_settings
@@ -157,6 +159,14 @@ def build_plan(configuration: RunConfiguration, describe: Describe = environment
         experiments.append(Experiment(defense, attack, defense.privacy(public), metadata, reason))
     unique = {experiment.metadata["experiment_id"]: experiment for experiment in experiments}
     return Plan(configuration, task, tuple(unique.values()), collection.samples, hashes, extractor, metrics, public, seed)
+
+
+def _explain_hidden_positions(task: Task, defense: Defense) -> str | None:
+    """Return the reason if the task needs other positions than the defense releases; None if it accepts them."""
+    if issubclass(defense.positions, task.accepts_positions):
+        return None
+    accepted = " or ".join(kind.__name__ for kind in task.accepts_positions)
+    return f"{task.name()} needs {accepted}; {defense.name()} releases {defense.positions.__name__}"
 
 
 def _default_metrics() -> Iterator[Metric]:
