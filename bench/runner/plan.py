@@ -13,7 +13,7 @@ from bench.core import environment, hashing
 from bench.core.errors import UserError
 from bench.images.samples import Images, Sample
 from bench.localization.scene_index import SceneIndex
-from bench.registry import discovery, fields, spec
+from bench.registry import composed, discovery, fields, spec
 from bench.runner import records
 from bench.runner.records import EVERY_SAMPLE, Record
 from bench.task_api import Execute, Task, execute_in_process
@@ -129,7 +129,8 @@ def build_plan(configuration: RunConfiguration, describe: Describe = environment
     if collection.scene is None:
         metrics = tuple(metric for metric in metrics if metric.compares != "views")
     metric_settings = {metric.name(): _settings(metric) for metric in metrics}
-    plugins = [plugin for pair in configuration.pairs for plugin in pair if plugin is not None]
+    attacks = [attack for _, attack in configuration.pairs if attack is not None]
+    plugins = [*attacks, *(part for defense, _ in configuration.pairs for part in composed.list_parts(defense))]
     environment_record = dict(describe([task, extractor, *plugins, *metrics]))
     experiments = []
     for defense, attack in configuration.pairs:
@@ -149,7 +150,7 @@ def build_plan(configuration: RunConfiguration, describe: Describe = environment
             "metric_settings": metric_settings,
             "seed": seed,
             "sources": {
-                "defense": environment.hash_plugin_file(defense),
+                "defense": _hash_defense(defense),
                 "attack": attack and environment.hash_plugin_file(attack),
             },
             "experiment_id": experiment_id,
@@ -167,6 +168,12 @@ def _explain_hidden_positions(task: Task, defense: Defense) -> str | None:
         return None
     accepted = " or ".join(kind.__name__ for kind in task.accepts_positions)
     return f"{task.name()} needs {accepted}; {defense.name()} releases {defense.positions.__name__}"
+
+
+def _hash_defense(defense: Defense) -> str | None:
+    """Return the hash of a defense's file, or of those of its parts."""
+    files = [environment.hash_plugin_file(part) for part in composed.list_parts(defense)]
+    return files[0] if len(files) == 1 else hashing.digest(files)
 
 
 def _default_metrics() -> Iterator[Metric]:

@@ -20,6 +20,7 @@ from bench.images import samples
 from bench.images.samples import Collection, Images
 from bench.images.scene import Mask
 from bench.registry import discovery, fields, spec
+from bench.registry.composed import Composed
 from bench.task_api import Outcome, Task, Trial
 from bench.threat_model import (
     DefenseDatabase,
@@ -79,12 +80,10 @@ class Reconstruction(Task):
         digests = dict(attack.assets(defense, extractor, public))
         if isinstance(attack, ImageAttack):
             return digests
-        inverter, undefended, reason = self._load_inverter(extractor, public)
+        inverter, left, reason = self._load_inverter(attack, defense, extractor, public)
         if reason is not None:
             return digests | {"inversion": None}
-        return digests | {
-            "inversion": spec.to_json_with_digests(inverter, public, inverter.assets(undefended, extractor, public))
-        }
+        return digests | {"inversion": spec.to_json_with_digests(inverter, public, inverter.assets(left, extractor, public))}
 
     def evaluate(self, trial: Trial) -> Outcome:
         attack = trial.attack
@@ -95,7 +94,7 @@ class Reconstruction(Task):
         if isinstance(attack, PositionAttack):
             return self._evaluate_positions(attack, trial)
         recovered = attack_cache.recover_cached(attack, trial, build_view(trial))
-        inverter, undefended, reason = self._load_inverter(trial.extractor, trial.public)
+        inverter, undefended, reason = self._load_inverter(attack, trial.defense, trial.extractor, trial.public)
         if reason is not None:
             outcome = compute_metrics(trial, recovered.selection, None, (*recovered.notes, f"no image: {reason}"))
             return dataclasses.replace(outcome, saved_seconds=recovered.saved_seconds)
@@ -114,21 +113,26 @@ class Reconstruction(Task):
             located = trial.execute(attack.locate, view, trial.rng)
             attack_cache.check_array(located, (len(trial.release), 2))
         release = dataclasses.replace(trial.release, positions=Points(keypoints=located))
-        inverter, undefended, reason = self._load_inverter(trial.extractor, trial.public)
-        if not isinstance(release, Descriptors):
-            reason = f"no network for {type(release).__name__} at recovered positions"
+        inverter, left, reason = self._load_inverter(attack, trial.defense, trial.extractor, trial.public)
         if reason is not None:
             return compute_metrics(trial, None, None, (*map(str, view.notes), f"no image: {reason}"), located)
-        shown = build_view(dataclasses.replace(trial.with_release(release), attack=inverter, defense=undefended))
+        shown = build_view(dataclasses.replace(trial.with_release(release), attack=inverter, defense=left))
         return compute_metrics(trial, None, reconstruct_image(inverter, shown, trial), tuple(map(str, view.notes)), located)
 
-    def _load_inverter(self, extractor: Extractor, public: Public) -> tuple[ImageAttack, Defense, str | None]:
-        """Return the attack that inverts raw descriptors, its defense, and the reason if it does not apply."""
+    def _load_inverter(
+        self, attack: Attack, defense: Defense, extractor: Extractor, public: Public
+    ) -> tuple[ImageAttack, Defense, str | None]:
+        """Return the attack that inverts what an attack recovers, the defense that is left, and the reason if it does not apply.
+
+        Recovered descriptors are raw. Recovered positions leave the descriptors of a composed defense protected.
+        """
         inverter = spec.read(self.inverter, discovery.ATTACK)
         if not isinstance(inverter, ImageAttack):
             raise UserError(f"reconstruction: inverter must reconstruct images, and {inverter.name()} does not")
-        undefended = discovery.load_plugin(discovery.DEFENSE, "none")()
-        return inverter, undefended, inverter.explain_not_applicable(undefended, extractor, public)
+        left: Defense = discovery.load_plugin(discovery.DEFENSE, "none")()
+        if isinstance(attack, PositionAttack) and isinstance(defense, Composed):
+            left = defense.descriptors
+        return inverter, left, inverter.explain_not_applicable(left, extractor, public)
 
 
 def offer_knowledge(attack: Attack, defense: Defense, public: Public) -> dict[type[Knowledge], Callable[[], Knowledge]]:
