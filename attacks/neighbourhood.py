@@ -6,7 +6,8 @@ the model of neighbours are ours.
 Method:
 
 1. Predict each keypoint's neighbours from the descriptors, by a small model trained on public photographs
-   (`bench/positions/neighbour_model.py`).
+   (`bench/positions/neighbour_model.py`). For word sets, the ratios of all pairs of candidates are averaged with the chance that
+   both are the true words.
 2. The estimate is the point of the line with the least weighted sum of truncated distances to the lines of its neighbours
    (`bench/positions/neighbourhood.py`).
 
@@ -24,18 +25,19 @@ import numpy as np
 
 from bench.api import Defense, Extractor, PositionAttack, View
 from bench.codebook.public import Public
+from bench.context.encoding import prior_odds
 from bench.positions import neighbour_model
 from bench.positions.neighbour_model import select_neighbours
 from bench.positions.neighbourhood import recover_positions
 from bench.threat_model import PublicAssets
-from bench.types import Descriptors, Floats, Lines
+from bench.types import Descriptors, Floats, Lines, WordSets
 
 
 @dataclass(frozen=True, kw_only=True)
 class Neighbourhood(PositionAttack):
     """Estimates each keypoint's position on its line from the lines of its likeliest neighbours."""
 
-    accepts = (Descriptors,)
+    accepts = (Descriptors, WordSets)
     needs = frozenset({PublicAssets})
 
     neighbours: int = 60  # the likeliest ones of a keypoint; tuned on tune.txt
@@ -51,10 +53,16 @@ class Neighbourhood(PositionAttack):
         return {"neighbour_model": neighbour_model.load().digest}
 
     def locate(self, view: View, rng: np.random.Generator) -> Floats:
-        release = view.release
-        if not isinstance(release, Descriptors) or not isinstance(release.positions, Lines):
-            raise TypeError(f"neighbourhood reads Descriptors at Lines, got {type(release).__name__}")
-        log_ratios = neighbour_model.load().log_ratios(release.descriptors[:, None])
+        release, public = view.release, view.know(PublicAssets).assets
+        if not isinstance(release.positions, Lines):
+            raise TypeError(f"neighbourhood reads Lines, got {type(release.positions).__name__}")
+        if isinstance(release, Descriptors):
+            log_ratios = neighbour_model.load().log_ratios(release.descriptors[:, None])
+        elif isinstance(release, WordSets):
+            odds = prior_odds(view.defense, public, release.subset_size)
+            log_ratios = neighbour_model.load().log_ratios(release.candidates, odds)
+        else:
+            raise TypeError(f"neighbourhood reads Descriptors or WordSets, got {type(release).__name__}")
         near, logs = select_neighbours(log_ratios, self.neighbours)
         return recover_positions(release.positions.lines, near, neighbour_model.weigh(logs), release.size, self.reach)
 
