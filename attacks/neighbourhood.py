@@ -40,8 +40,8 @@ class Neighbourhood(PositionAttack):
     accepts = (Descriptors, WordSets)
     needs = frozenset({PublicAssets})
 
-    neighbours: int = 60  # the likeliest ones of a keypoint; tuned on tune.txt
-    reach: float = 10.0  # pixels; a line farther away than this costs no more than one at this distance; tuned on tune.txt
+    neighbours: int = 30  # the likeliest ones of a keypoint; tuned on tune.txt
+    reach: float = 15.0  # pixels; a line farther away than this costs no more than one at this distance; tuned on tune.txt
 
     def explain_incompatible(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
         trained = neighbour_model.load().meta["extractor"]
