@@ -25,10 +25,9 @@ import numpy as np
 
 from bench.api import Defense, Extractor, PositionAttack, View
 from bench.codebook.public import Public
-from bench.context.encoding import prior_odds
 from bench.positions import neighbour_model
-from bench.positions.neighbour_model import select_neighbours
 from bench.positions.neighbourhood import recover_positions
+from bench.positions.prediction import predict_neighbours
 from bench.threat_model import PublicAssets
 from bench.types import Descriptors, Floats, Lines, WordSets
 
@@ -40,8 +39,8 @@ class Neighbourhood(PositionAttack):
     accepts = (Descriptors, WordSets)
     needs = frozenset({PublicAssets})
 
-    neighbours: int = 60  # the likeliest ones of a keypoint; tuned on tune.txt
-    reach: float = 10.0  # pixels; a line farther away than this costs no more than one at this distance; tuned on tune.txt
+    neighbours: int = 30  # the likeliest ones of a keypoint; tuned on tune.txt
+    reach: float = 15.0  # pixels; a line farther away than this costs no more than one at this distance; tuned on tune.txt
 
     def explain_incompatible(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
         trained = neighbour_model.load().meta["extractor"]
@@ -53,18 +52,11 @@ class Neighbourhood(PositionAttack):
         return {"neighbour_model": neighbour_model.load().digest}
 
     def locate(self, view: View, rng: np.random.Generator) -> Floats:
-        release, public = view.release, view.know(PublicAssets).assets
+        release = view.release
         if not isinstance(release.positions, Lines):
             raise TypeError(f"neighbourhood reads Lines, got {type(release.positions).__name__}")
-        if isinstance(release, Descriptors):
-            log_ratios = neighbour_model.load().log_ratios(release.descriptors[:, None])
-        elif isinstance(release, WordSets):
-            odds = prior_odds(view.defense, public, release.subset_size)
-            log_ratios = neighbour_model.load().log_ratios(release.candidates, odds)
-        else:
-            raise TypeError(f"neighbourhood reads Descriptors or WordSets, got {type(release).__name__}")
-        near, logs = select_neighbours(log_ratios, self.neighbours)
-        return recover_positions(release.positions.lines, near, neighbour_model.weigh(logs), release.size, self.reach)
+        near, weights = predict_neighbours(release, view.defense, view.know(PublicAssets).assets, self.neighbours)
+        return recover_positions(release.positions.lines, near, weights, release.size, self.reach)
 
 
 PLUGIN = Neighbourhood

@@ -48,8 +48,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--steps", type=int, default=4000)
-    parser.add_argument("--photographs", type=int, default=800)
+    parser.add_argument("--steps", type=int, default=2500)
+    parser.add_argument("--photographs", type=int, default=500)
     args = parser.parse_args()
     torch.set_num_threads(1)
     lists = {name: set((args.data / f"{name}.txt").read_text().split()) for name in ("tune", "test")}

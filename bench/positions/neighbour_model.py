@@ -76,7 +76,7 @@ def select_neighbours(log_ratios: Floats, count: int) -> tuple[Indices, Floats]:
     return order, np.take_along_axis(log_ratios, order, axis=1)
 
 
-def weigh(log_ratios: Floats, odds: float = -4.0) -> Floats:
+def weigh(log_ratios: Floats, odds: float = -5.0) -> Floats:
     """Return the chance that keypoints are neighbours, from their log-ratio and the log odds of two random keypoints."""
     weights: Floats = (1 / (1 + np.exp(-np.clip(log_ratios + odds, -50, 50)))).astype(np.float32)
     return weights

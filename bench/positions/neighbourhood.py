@@ -26,7 +26,12 @@ BLOCK = 256  # lines that are processed together
 
 
 def recover_positions(
-    lines: Floats, neighbours: Indices, weights: Floats, size: tuple[int, int], reach: float = np.inf
+    lines: Floats,
+    neighbours: Indices,
+    weights: Floats,
+    size: tuple[int, int],
+    reach: float = np.inf,
+    known: Floats | None = None,
 ) -> Floats:
     """Return the estimated position on each line. -> (N, 2) float32 pixels
 
@@ -36,12 +41,16 @@ def recover_positions(
     neighbours : (N, k) rows of the lines
     weights : (N, k) at least 0; 0 leaves a neighbour out
     reach : pixels; a line farther away than this costs no more than one at this distance
+    known : (N, 2) positions of some neighbours, NaN for the others; the nearest point to a known position replaces the crossing
     """
     clipped = clip_lines(lines, size)
     best = np.empty(len(lines))
     for start in range(0, len(lines), BLOCK):
         rows = slice(start, start + BLOCK)
         crossings, slopes = _cross(clipped, rows, neighbours[rows])  # (B, k) twice
+        if known is not None:
+            steps = np.einsum("bkd,bd->bk", known[neighbours[rows]] - clipped.feet[rows, None], clipped.along[rows])
+            crossings, slopes = np.where(np.isnan(steps), crossings, steps), np.where(np.isnan(steps), slopes, 1.0)
         first, last = clipped.first[rows, None], clipped.last[rows, None]
         tried = np.clip(crossings, first, last)
         distances = np.abs(tried[:, :, None] - crossings[:, None, :]) * slopes[:, None, :]  # (B, k, k)

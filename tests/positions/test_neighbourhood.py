@@ -69,3 +69,12 @@ def test_true_neighbours_reveal_the_positions_in_photographs(axes: bool) -> None
     assert error(recover_positions(lines, find_neighbours(xy, 10), weights, features.size)) < 6
     assert error(recover_positions(lines, rng.integers(count, size=(count, 10)), weights, features.size)) > 30
     assert error(find_densest(lines, features.size)) > 30
+
+
+def test_a_neighbour_at_a_known_position_gives_the_nearest_point(rng: np.random.Generator) -> None:
+    xy = rng.uniform(0, 1, (6, 2)) * SIZE
+    lines, known = draw_lines(rng, xy), np.full((6, 2), np.nan)
+    known[1:] = xy[0]  # all neighbours of the first keypoint lie at it
+    neighbours = np.array([[1, 2, 3]] * 6)
+    position = recover_positions(lines, neighbours, np.ones((6, 3)), SIZE, known=known)[0]
+    np.testing.assert_allclose(position, xy[0], atol=1e-3)
