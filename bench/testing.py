@@ -37,9 +37,10 @@ from bench.localization.scene_index import SceneIndex
 from bench.task_api import Outcome, ProtectedImage, Task, Trial
 from bench.tasks.reconstruction import Reconstruction, build_view
 from bench.threat_model import TrueNeighbours, TrueWords
-from bench.types import Descriptors, Features, Floats, Indices, Lines, Points, Release, Subspaces, WordSets
+from bench.types import Descriptors, Features, Floats, Indices, Lines, Permuted, Points, Release, Subspaces, WordSets
 
 TOLERANCE = 1e-5  # of norms and angles in float32
+LINE_TOLERANCE = 1e-3  # pixels, between a keypoint and its line
 
 
 EMPTY_SAMPLE = Sample(name="made up", images=())
@@ -65,9 +66,9 @@ def check_defense(defense: Defense, public: Public, secret: Features) -> None:
     if isinstance(release.positions, Points):
         _require(np.array_equal(release.keypoints, secret.keypoints), "the released keypoints differ from the secret ones")
     if isinstance(release.positions, Lines):
-        normals, offsets = release.positions.lines[:, :2], release.positions.lines[:, 2]
-        np.testing.assert_allclose((normals * secret.keypoints).sum(axis=1) + offsets, 0, atol=1e-3)
-        np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=TOLERANCE)
+        _check_lines(release.positions, secret.keypoints, "keypoint")
+    if isinstance(release.positions, Permuted):
+        _check_permuted(release.positions, secret.keypoints)
     _require(release.size == secret.size, "the released size of the photograph differs from that of the secret")
     _check_release(release, len(secret))
     _require(are_equal(release, defense.protect(secret, public, np.random.default_rng(1))), "the same rng gave another release")
@@ -324,6 +325,20 @@ def _arrays(value: Any) -> list[np.ndarray]:
 
 def _shared(release: Release, secret: Features) -> bool:
     return any(np.shares_memory(mine, theirs) for mine in _arrays(release) for theirs in _arrays(secret))
+
+
+def _check_lines(positions: Lines, points: Floats, kind: str) -> None:
+    lines = positions.lines.astype(np.float64)
+    np.testing.assert_allclose(np.linalg.norm(lines[:, :2], axis=1), 1, atol=TOLERANCE)
+    misses = np.abs((lines[:, :2] * points).sum(axis=1) + lines[:, 2]).max()
+    _require(misses <= LINE_TOLERANCE, f"a line misses its {kind} by {misses:.3g} pixels")
+
+
+def _check_permuted(positions: Permuted, keypoints: Floats) -> None:
+    points = positions.points
+    _require(not (points == keypoints).all(axis=1).any(), "a permuted point is its keypoint: it exchanged no coordinate")
+    _require(arrays_equal(np.sort(points, axis=0), np.sort(keypoints, axis=0)), "a permuted coordinate is that of no keypoint")
+    _check_lines(positions, points, "permuted point")
 
 
 def _check_release(release: Release, count: int) -> None:

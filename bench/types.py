@@ -87,6 +87,16 @@ class Lines(Positions):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Permuted(Lines):
+    """Points with one coordinate of their keypoint and one of another keypoint. The line has all points of the former."""
+
+    points: Floats  # (N, 2) x, y in pixels
+
+    def take(self, rows: NDArray[Any]) -> Permuted:
+        return Permuted(lines=self.lines[rows], points=self.points[rows])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Release:
     """The data that leave the phone: positions × descriptors.
 

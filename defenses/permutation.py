@@ -1,15 +1,20 @@
-"""Permutation: swaps one coordinate of each keypoint with that of another one. Descriptors are released unchanged.
+"""Permutation: pairs of keypoints exchange one coordinate. Descriptors are released unchanged.
 
-Source: after Pan, Schönberger, Larsson and Pollefeys, "Privacy Preserving Localization via Coordinate Permutations", ICCV 2023. A
-permuted point has x of one keypoint and y of another, and the descriptors of both. So each descriptor has one known coordinate.
+Source: after Pan, Schönberger, Larsson and Pollefeys, "Privacy Preserving Localization via Coordinate Permutations", ICCV 2023.
 
-Method: draw for each keypoint, with equal chances, whether its x or its y is released, and release the line of that coordinate.
+Method:
 
-Guarantee: none.
+1. Draw a pairing of the keypoints. If their number is odd, one triple exchanges its coordinates in a circle.
+2. Draw for each pair, with equal chances, whether x or y is exchanged. Release the points, and which coordinate is exchanged.
 
-Limits: as those of `lines`, with lines that are parallel to the sides of the image. Difference to the source: half of the
-coordinates are released on average, instead of exactly half, and the pairs of permuted points are not formed. They carry no
-information beyond the lines.
+Keypoints come in random order (`bench.mechanisms.protection.hide_order`). A single keypoint exchanges with a random number.
+
+Guarantee: none. The other coordinate stays in the clear.
+
+Limits: as those of `lines`, with lines that are parallel to the sides of the image. The exchanged coordinates are those of other
+keypoints, so each true coordinate is among the released ones. Keypoints of a pair with an equal coordinate may stay in place.
+Differences to the source, of which only the abstract and descriptions by others were read: there, the positions are recovered
+during pose estimation. Here, localization reads the lines alone.
 """
 
 from __future__ import annotations
@@ -22,21 +27,30 @@ import numpy as np
 from bench.api import Defense, Privacy
 from bench.codebook.public import Public
 from bench.positions.lines import draw_lines
-from bench.types import Descriptors, Features, Lines, Positions
+from bench.types import Descriptors, Features, Permuted, Positions
 
 
 @dataclass(frozen=True, kw_only=True)
 class Permutation(Defense):
-    """Releases one coordinate of each keypoint, and the descriptors unchanged."""
+    """Exchanges one coordinate between pairs of keypoints, and releases the descriptors unchanged."""
 
     releases = Descriptors
-    positions: ClassVar[type[Positions]] = Lines
+    positions: ClassVar[type[Positions]] = Permuted
 
     def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> Descriptors:
-        angles = rng.integers(0, 2, len(secret)) * (np.pi / 2)
-        return Descriptors(
-            positions=draw_lines(secret.keypoints, angles), size=secret.size, descriptors=secret.descriptors.copy()
-        )
+        count = len(secret)
+        groups = np.array_split(rng.permutation(count), max(1, count // 2))  # pairs, and a triple if the number is odd
+        axes = np.zeros(count, np.int64)  # of the exchanged coordinates
+        points = secret.keypoints.copy()
+        for group, axis in zip(groups, rng.integers(0, 2, len(groups)), strict=True):
+            axes[group] = axis
+            points[group, axis] = secret.keypoints[np.roll(group, 1), axis]
+        if count == 1:
+            points[0, axes[0]] = rng.uniform(0, secret.size[axes[0]])
+        angles = np.where(axes == 0, np.pi / 2, 0.0)  # of the normals: along the coordinate that is not exchanged
+        lines = draw_lines(secret.keypoints, angles).lines
+        positions = Permuted(lines=lines, points=points)
+        return Descriptors(positions=positions, size=secret.size, descriptors=secret.descriptors.copy())
 
     def privacy(self, public: Public) -> Privacy:
         return Privacy("none")

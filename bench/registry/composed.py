@@ -33,9 +33,9 @@ class Composed(Defense):
     def __post_init__(self) -> None:
         for name in INHERITED:
             object.__setattr__(self, name, getattr(self.descriptors, name))
-        for name in (self.dictionary_field, self.word_count_field):
-            if name is not None:
-                object.__setattr__(self, name, getattr(self.descriptors, name))
+        for field in (self.dictionary_field, self.word_count_field):
+            if field is not None:
+                object.__setattr__(self, field, getattr(self.descriptors, field))
         object.__setattr__(self, "positions", self.geometry.positions)
 
     @property
