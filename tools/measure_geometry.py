@@ -43,7 +43,6 @@ SHOWN = {"position-error": 1, "ssim": 3, "psnr": 2, "identified": 3}  # metric -
 SCENE = "gallery:views=40,queries=12,rooms=2"
 LOCALIZED = ("none", "lines", "permutation")
 RECALLS = {"recall_0.25m_2deg": "0.25 m, 2°", "recall_0.5m_5deg": "0.5 m, 5°", "recall_5m_10deg": "5 m, 10°"}
-NOTES = Path(__file__).with_name("geometry_notes.md")
 
 
 def main() -> None:
@@ -59,7 +58,7 @@ def main() -> None:
     attacked = {pair: attack_positions(*pair, args.work / "attacks") for pair in pairs}
     localized = {defense: localize(defense, args.work / "localization") for defense in LOCALIZED}
     records = [record for some in (*attacked.values(), *localized.values()) for record in some]
-    parts = [TITLE, write_attacks(attacked), write_localization(localized), NOTES.read_text(encoding="utf-8")]
+    parts = [TITLE, write_attacks(attacked), write_localization(localized)]
     write_page("geometry.md", "\n".join(parts), records)
 
 
