@@ -21,7 +21,7 @@ from bench.api import Defense, Extractor, ImageAttack, View
 from bench.codebook.public import Public
 from bench.identification import distractors
 from bench.threat_model import PublicAssets
-from bench.types import Descriptors, Floats, Subspaces, WordSets
+from bench.types import Descriptors, Floats, Positions, Subspaces, WordSets
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,6 +29,7 @@ class Blank(ImageAttack):
     """Returns the best constant image, whatever the release."""
 
     accepts = (Descriptors, WordSets, Subspaces)
+    accepts_positions = (Positions,)
     needs = frozenset({PublicAssets})
 
     def assets(self, defense: Defense, extractor: Extractor, public: Public) -> Mapping[str, str]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from bench.settings import Between, OneOf
 from bench.threat_model import Knowledge
-from bench.types import Features, Floats, Indices, Release, Subspaces
+from bench.types import Features, Floats, Indices, Lines, Points, Positions, Release, Subspaces
 
 if TYPE_CHECKING:
     from bench.codebook.public import Public
@@ -59,6 +59,7 @@ class Defense(Plugin, ABC):
     """Turns the secret features into a release."""
 
     releases: ClassVar[type[Release]]
+    positions: ClassVar[type[Positions]] = Points  # of the release
     # Field -> the values that one trained network supports. Training draws them at random.
     supported_settings: ClassVar[Mapping[str, Between | OneOf]] = {}
     # Field that names the dictionary for the quantisation, and field with the number of its words in use.
@@ -151,9 +152,10 @@ class View:
 
 
 class Attack(Plugin, ABC):
-    """Reads a `View` and undoes the defense. Subclass `DescriptorAttack`, `SelectiveAttack` or `ImageAttack`."""
+    """Reads a `View` and undoes the defense. Subclass one of the four classes below."""
 
     accepts: ClassVar[tuple[type[Release], ...]]
+    accepts_positions: ClassVar[tuple[type[Positions], ...]] = (Points,)
     needs: ClassVar[frozenset[type[Knowledge]]] = frozenset()
 
     def repeats(self) -> int:
@@ -177,6 +179,9 @@ class Attack(Plugin, ABC):
         if not issubclass(defense.releases, self.accepts):
             accepted = " or ".join(kind.__name__ for kind in self.accepts)
             return f"{self.name()} attacks {accepted}; {defense.name()} releases {defense.releases.__name__}"
+        if not issubclass(defense.positions, self.accepts_positions):
+            accepted = " or ".join(kind.__name__ for kind in self.accepts_positions)
+            return f"{self.name()} reads {accepted}; {defense.name()} releases {defense.positions.__name__}"
         return self.explain_incompatible(defense, extractor, public)
 
 
@@ -212,6 +217,16 @@ class ImageAttack(Attack):
         """Return an (H, W, 3) float32 RGB image in [0, 1] of the release's size."""
 
 
+class PositionAttack(Attack):
+    """Recovers the hidden position of each keypoint. The network for the released descriptors then reconstructs the image."""
+
+    accepts_positions = (Lines,)
+
+    @abstractmethod
+    def locate(self, view: View, rng: np.random.Generator) -> Floats:
+        """Return (N, 2) float32 positions in pixels, in the order of the release's keypoints."""
+
+
 def explain_no_words(defense: Defense) -> str | None:
     """Return the reason why the subspaces of the defense contain no database word; None if they contain some."""
     if not isinstance(defense, Lifting):
@@ -242,7 +257,8 @@ class Metric(Plugin, ABC):
     """A pure function of the truth and an estimate."""
 
     # "views" compares a reconstruction with other views of its scene, and is computed on datasets alone.
-    compares: ClassVar[Literal["images", "descriptors", "views"]]
+    # "positions" compares keypoints, and is computed only in runs with an attack on positions.
+    compares: ClassVar[Literal["images", "descriptors", "views", "positions"]]
     unit: ClassVar[str]
     range: ClassVar[tuple[float, float]]
     higher_is_better_for: ClassVar[Literal["attacker", "defender"]]
@@ -257,7 +273,8 @@ class Metric(Plugin, ABC):
 
     @abstractmethod
     def __call__(self, truth: Floats, estimate: Floats) -> float | None:
-        """Return the value; None if it is not finite. Images are (H, W, 3) in [0, 1], descriptors are (N, D).
+        """Return the value; None if it is not finite. Images are (H, W, 3) in [0, 1], descriptors are (N, D),
+        positions are (N, 2) pixels.
 
         For "views", the truth has (256, 16, 16) thumbnails (`bench.identification`): another view of the scene, then views of
         others. The estimate is an image.

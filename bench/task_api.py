@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from bench.api import Attack, Dataset, Defense, Extractor, Metric, Plugin, View
-from bench.types import Bytes, Features, Floats, Release
+from bench.types import Bytes, Features, Floats, Points, Positions, Release
 
 if TYPE_CHECKING:
     from bench.codebook.public import Public
@@ -100,6 +100,7 @@ class Task(Plugin, ABC):
     judges_attacks: ClassVar[bool]  # whether it evaluates the result of an attack, not the release itself
     needs_scene: ClassVar[bool] = False  # whether its samples come from a scene; without a dataset it has a default scene
     needs_map: ClassVar[bool] = False  # whether it uses the server's map
+    accepts_positions: ClassVar[tuple[type[Positions], ...]] = (Points,)
 
     @abstractmethod
     def collect(self, images: Images, dataset: Dataset | None) -> Collection:

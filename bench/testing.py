@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.api import Attack, Dataset, Defense, DescriptorAttack, Extractor, ImageAttack, Metric, SelectiveAttack
+from bench.api import Attack, Dataset, Defense, DescriptorAttack, Extractor, ImageAttack, Metric, PositionAttack, SelectiveAttack
 from bench.cache import feature_cache, store
 from bench.codebook import dictionary
 from bench.codebook.examples import draw_features
@@ -36,10 +36,11 @@ from bench.localization import maps
 from bench.localization.scene_index import SceneIndex
 from bench.task_api import Outcome, ProtectedImage, Task, Trial
 from bench.tasks.reconstruction import Reconstruction, build_view
-from bench.threat_model import TrueWords
-from bench.types import Descriptors, Features, Floats, Indices, Release, Subspaces, WordSets
+from bench.threat_model import TrueNeighbours, TrueWords
+from bench.types import Descriptors, Features, Floats, Indices, Lines, Permuted, Points, Release, Subspaces, WordSets
 
 TOLERANCE = 1e-5  # of norms and angles in float32
+LINE_TOLERANCE = 1e-3  # pixels, between a keypoint and its line
 
 
 EMPTY_SAMPLE = Sample(name="made up", images=())
@@ -61,11 +62,17 @@ def check_defense(defense: Defense, public: Public, secret: Features) -> None:
     _require(type(release) is defense.releases, f"released {type(release).__name__}, declares {defense.releases.__name__}")
     _require(are_equal(secret, before), "changed the secret")
     _require(not _shared(release, secret), "the release shares memory with the secret")
-    _require(np.array_equal(release.keypoints, secret.keypoints), "the released keypoints differ from the secret ones")
+    _require(type(release.positions) is defense.positions, f"released {type(release.positions).__name__} as positions")
+    if isinstance(release.positions, Points):
+        _require(np.array_equal(release.keypoints, secret.keypoints), "the released keypoints differ from the secret ones")
+    if isinstance(release.positions, Lines):
+        _check_lines(release.positions, secret.keypoints, "keypoint")
+    if isinstance(release.positions, Permuted):
+        _check_permuted(release.positions, secret.keypoints)
     _require(release.size == secret.size, "the released size of the photograph differs from that of the secret")
     _check_release(release, len(secret))
     _require(are_equal(release, defense.protect(secret, public, np.random.default_rng(1))), "the same rng gave another release")
-    if not isinstance(release, Descriptors):
+    if not isinstance(release, Descriptors) or not isinstance(release.positions, Points):
         other = defense.protect(secret, public, np.random.default_rng(2))
         _require(not are_equal(release, other), "another rng gave the same release")
     privacy = defense.privacy(public)
@@ -138,10 +145,13 @@ def _check_attack(
         _require(estimate.shape == (*secret.size[::-1], 3), "the result has another size than the photograph")
         _require(estimate.min() >= 0, "the result has values below 0")
         _require(estimate.max() <= 1, "the result has values above 1")
-    if not isinstance(attack, ImageAttack):
+    elif isinstance(attack, PositionAttack):
+        _require(estimate.shape == secret.keypoints.shape, "the result has another shape than the keypoints of the secret")
+        _require(np.isfinite(estimate).all(), "the result has values that are not finite")
+    if not isinstance(attack, (ImageAttack, PositionAttack)):
         np.testing.assert_allclose(np.linalg.norm(estimate, axis=1), 1, atol=TOLERANCE)
     _require(estimate.dtype == np.float32, "the result is not float32")
-    if TrueWords in attack.needs:
+    if {TrueWords, TrueNeighbours} & attack.needs:
         return  # an oracle reads a part of the secret, by declaration
     for array in (*_arrays(mine), *quantised):
         array[...] = 0
@@ -157,6 +167,9 @@ def check_metric(metric: Metric, seed: int = 0) -> None:
     rng = np.random.default_rng(seed)
     if metric.compares == "descriptors":
         truth, estimate = draw_features(30, seed).descriptors, draw_features(30, seed + 1).descriptors
+        best_estimate = truth.copy()
+    elif metric.compares == "positions":
+        truth, estimate = draw_features(30, seed).keypoints, draw_features(30, seed + 1).keypoints
         best_estimate = truth.copy()
     else:
         # A portrait, since a metric such as `face` has no value for a picture without a face. The estimate is noise alone, since
@@ -298,6 +311,8 @@ def _estimate(trial: Trial) -> Floats:
         return trial.attack.select(view, rng).descriptors
     if isinstance(trial.attack, ImageAttack):
         return trial.attack.reconstruct(view, rng)
+    if isinstance(trial.attack, PositionAttack):
+        return trial.attack.locate(view, rng)
     raise AssertionError("the attack recovers neither descriptors nor images")
 
 
@@ -310,6 +325,20 @@ def _arrays(value: Any) -> list[np.ndarray]:
 
 def _shared(release: Release, secret: Features) -> bool:
     return any(np.shares_memory(mine, theirs) for mine in _arrays(release) for theirs in _arrays(secret))
+
+
+def _check_lines(positions: Lines, points: Floats, kind: str) -> None:
+    lines = positions.lines.astype(np.float64)
+    np.testing.assert_allclose(np.linalg.norm(lines[:, :2], axis=1), 1, atol=TOLERANCE)
+    misses = np.abs((lines[:, :2] * points).sum(axis=1) + lines[:, 2]).max()
+    _require(misses <= LINE_TOLERANCE, f"a line misses its {kind} by {misses:.3g} pixels")
+
+
+def _check_permuted(positions: Permuted, keypoints: Floats) -> None:
+    points = positions.points
+    _require(not (points == keypoints).all(axis=1).any(), "a permuted point is its keypoint: it exchanged no coordinate")
+    _require(arrays_equal(np.sort(points, axis=0), np.sort(keypoints, axis=0)), "a permuted coordinate is that of no keypoint")
+    _check_lines(positions, points, "permuted point")
 
 
 def _check_release(release: Release, count: int) -> None:

@@ -80,6 +80,18 @@ class TrueWords(Knowledge):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class TrueNeighbours(Knowledge):
+    """The order of the other keypoints by their distance. It is part of the secret: no attacker has it.
+
+    An attack that needs it is an oracle: a ceiling for attacks that predict neighbours, and no evidence of leakage.
+    """
+
+    description = "the true neighbours, which no attacker knows"
+
+    order: Indices  # (N, N − 1) rows, nearest first
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class ServerMap(Knowledge):
     """The server of a localization service, with its map."""
 

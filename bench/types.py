@@ -76,6 +76,29 @@ class Points(Positions):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Lines(Positions):
+    """One line per keypoint, which passes through it."""
+
+    lines: Floats  # (N, 3) a, b, c of {(x, y): a x + b y + c = 0} in pixels, a² + b² = 1
+
+    def __len__(self) -> int:
+        return len(self.lines)
+
+    def take(self, rows: NDArray[Any]) -> Lines:
+        return Lines(lines=self.lines[rows])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Permuted(Lines):
+    """Points with one coordinate of their keypoint and one of another keypoint. The line has all points of the former."""
+
+    points: Floats  # (N, 2) x, y in pixels
+
+    def take(self, rows: NDArray[Any]) -> Permuted:
+        return Permuted(lines=self.lines[rows], points=self.points[rows])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Release:
     """The data that leave the phone: positions × descriptors.
 

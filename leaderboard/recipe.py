@@ -13,7 +13,6 @@ from bench.codebook.public import SHIPPED
 from bench.core.errors import UserError
 from bench.registry import discovery, fields
 from bench.registry.discovery import Kind
-from bench.runner.records import Record
 from bench.task_api import Task
 from leaderboard import provenance
 from leaderboard.comparison import GroupedExperiment
@@ -51,7 +50,13 @@ def build_recipe(experiment: GroupedExperiment, lookup: Lookup = find_plugin) ->
     task = {"name": metadata["task"], **(metadata.get("task_settings") or {})}
     options = [
         ("--task", spec(discovery.TASK, task, needs)),
-        ("--defense", spec(discovery.DEFENSE, metadata["defense"], needs, _find_scene_field(lookup, metadata))),
+        (
+            "--defense",
+            "+".join(
+                spec(discovery.DEFENSE, part, needs, _find_scene_field(lookup, metadata["task"], part))
+                for part in metadata["defense"].get("parts", [metadata["defense"]])
+            ),
+        ),
     ]
     if metadata["attack"] is not None:
         options.append(("--attack", spec(discovery.ATTACK, metadata["attack"], needs)))
@@ -72,9 +77,9 @@ def _format_option(name: str, text: str) -> str:
     return f"{name}{'=' if text.startswith('-') else ' '}{shlex.quote(text)}"
 
 
-def _find_scene_field(lookup: Lookup, metadata: Record) -> str | None:
+def _find_scene_field(lookup: Lookup, task_name: str, configuration: Mapping[str, Any]) -> str | None:
     """Return the field of the defense that a task with a scene fills with a dictionary of that scene."""
-    task, defense = lookup(discovery.TASK, metadata["task"]), lookup(discovery.DEFENSE, metadata["defense"]["name"])
+    task, defense = lookup(discovery.TASK, task_name), lookup(discovery.DEFENSE, configuration["name"])
     has_scene = task is not None and issubclass(task, Task) and task.needs_scene
     return defense.dictionary_field if has_scene and defense is not None and issubclass(defense, Defense) else None
 

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from bench.api import Plugin
+from bench.api import Defense, Plugin
 from bench.codebook.clustered import name_digest
 from bench.codebook.public import ASSETS, CLUSTERED, REFERENCES, SHIPPED
 from bench.core import strict_json
@@ -24,6 +24,7 @@ from bench.core.progress import Progress
 from bench.images.photographs import list_photographs
 from bench.images.samples import Images
 from bench.registry import discovery, fields, spec
+from bench.registry.composed import compose
 from bench.registry.discovery import Kind
 from bench.runner import consistency, records
 from bench.runner.attack_process import execute_in_attack_process
@@ -214,13 +215,20 @@ def _rebuild_plans(lines: Sequence[NumberedRecord], inputs: _LocalInputs) -> Ite
             yield Fault(first.number, " ".join(str(error).split()))
 
 
+def _build_defense(configuration: Record, inputs: _LocalInputs, *, has_scene: bool) -> Defense:
+    defense: Defense = inputs.plugin(discovery.DEFENSE, configuration)
+    field = defense.dictionary_field
+    if has_scene and field is not None and configuration[field] not in inputs.assets:
+        return dataclasses.replace(defense, **{field: Asset(REFERENCES)})  # type: ignore[type-var]
+    return defense
+
+
 def _build_configuration(record: Record, inputs: _LocalInputs) -> RunConfiguration:
     task: Task = inputs.plugin(discovery.TASK, {"name": record["task"], **record["task_settings"]})
     dataset = record["dataset"]["spec"]
-    defense = inputs.plugin(discovery.DEFENSE, record["defense"])
-    field = defense.dictionary_field
-    if dataset is not None and field is not None and record["defense"][field] not in inputs.assets:
-        defense = dataclasses.replace(defense, **{field: Asset(REFERENCES)})  # type: ignore[type-var]
+    configurations = record["defense"].get("parts", [record["defense"]])
+    parts = [_build_defense(configuration, inputs, has_scene=dataset is not None) for configuration in configurations]
+    defense = parts[0] if len(parts) == 1 else compose(parts)
     return RunConfiguration(
         pairs=((defense, None if record["attack"] is None else inputs.plugin(discovery.ATTACK, record["attack"])),),
         images=inputs.photographs(record),

@@ -287,6 +287,8 @@ def _group_by(records: Iterable[Record], key: Callable[[Record], Any]) -> list[l
 def _label(configuration: Configuration, *, digests: bool = False) -> str:
     if configuration is None:
         return "none needed"
+    if "parts" in configuration:
+        return "+".join(_label(part, digests=digests) for part in configuration["parts"])
     settings = [
         f"{name}={format_setting(value)}"
         for name, value in configuration.items()

@@ -141,6 +141,8 @@ def _find_same_defense(standing: Standing, experiments: Sequence[GroupedExperime
 
 
 def _drop_files(configuration: Mapping[str, Any]) -> dict[str, Any]:
+    if "parts" in configuration:
+        return {**configuration, "parts": [_drop_files(part) for part in configuration["parts"]]}
     return {name: None if str(value).startswith("sha256:") else value for name, value in configuration.items()}
 
 

@@ -12,13 +12,13 @@ from bench.codebook.dictionary import Dictionary
 from bench.codebook.public import REFERENCES, Public
 from bench.core.randomness import derive_generator
 from bench.geometry.subspaces import guess_descriptors
-from bench.localization import map_matching, pose
+from bench.localization import line_pose, map_matching, pose
 from bench.localization.map_matching import Correspondences, RetrievedReferences
 from bench.localization.pose import Estimate
 from bench.localization.retrieval import TOP
 from bench.localization.scene_index import SceneIndex
 from bench.registry import spec
-from bench.types import Bytes, Descriptors, Features, Floats, Indices, Points, Release, Subspaces, WordSets
+from bench.types import Bytes, Descriptors, Features, Floats, Indices, Lines, Points, Release, Subspaces, WordSets
 
 if TYPE_CHECKING:
     import pycolmap
@@ -89,8 +89,17 @@ class Server:
             lift=None if defense is None else lambda reference: self._lift_reference(defense, reference),
         )
         correspondences = method.match(release, retrieved)
-        estimate = pose.estimate(*self._gather_points(release, correspondences), self.camera, trials=trials, seed=seed)
-        return LocalizationResult(correspondences=correspondences, estimate=estimate)
+        return LocalizationResult(
+            correspondences=correspondences, estimate=self._estimate_pose(release, correspondences, trials, seed)
+        )
+
+    def _estimate_pose(self, release: Release, pairs: Correspondences, trials: int, seed: int) -> Estimate | None:
+        """Return the pose from the released points or lines of the correspondences."""
+        if isinstance(release.positions, Lines):
+            lines = release.positions.lines[pairs.keypoints].astype(np.float64)
+            xyz = self.scene_index.map.xyz[pairs.points]
+            return line_pose.estimate(lines, xyz, self.camera, trials=trials, seed=seed)
+        return pose.estimate(*self._gather_points(release, pairs), self.camera, trials=trials, seed=seed)
 
     def estimate_focal_mismatch(self, query: Features) -> float | None:
         """Return the focal length estimated from raw features, relative to the camera's; None unless they clearly differ."""

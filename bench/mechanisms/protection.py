@@ -16,7 +16,7 @@ from bench.codebook.public import Public
 from bench.core.errors import UserError
 from bench.core.hashing import canonical_json
 from bench.registry import spec
-from bench.types import Features, Release
+from bench.types import Features, Points, Release
 
 KEY_BYTES = 32  # bytes
 
@@ -42,7 +42,13 @@ def protect(features: Features, defense: Defense, public: Public | None = None, 
     if device is not None and not defense.is_memoized():
         raise UserError(f"{defense.name()}, as configured, is not memoized; omit device=, because a key would repeat the draws")
     key = secrets.token_bytes(KEY_BYTES) if device is None else _derive_key(_load_device_key(Path(device)), defense, public)
-    return defense.protect(features, public, create_generator(key))
+    rng = create_generator(key)
+    return defense.protect(hide_order(features, defense, rng), public, rng)
+
+
+def hide_order(secret: Features, defense: Defense, rng: np.random.Generator) -> Features:
+    """Return the features in random order if the defense hides positions: their order by position would reveal them."""
+    return secret if defense.positions is Points else secret.take(rng.permutation(len(secret)))
 
 
 def create_generator(key: bytes) -> np.random.Generator:

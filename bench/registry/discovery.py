@@ -19,7 +19,7 @@ from importlib.abc import InspectLoader
 from importlib.metadata import entry_points
 from typing import Any, Generic, TypeVar
 
-from bench.api import Dataset, Defense, DescriptorAttack, Extractor, ImageAttack, Metric, Plugin, SelectiveAttack
+from bench.api import Dataset, Defense, DescriptorAttack, Extractor, ImageAttack, Metric, Plugin, PositionAttack, SelectiveAttack
 from bench.core.errors import UserError, unknown_name
 from bench.registry import fields
 from bench.task_api import Task
@@ -38,8 +38,8 @@ class Kind(Generic[P]):
 
 
 DEFENSE = Kind("defense", "defenses", "feature_privacy.defenses", (Defense,))
-ATTACK = Kind[DescriptorAttack | SelectiveAttack | ImageAttack](
-    "attack", "attacks", "feature_privacy.attacks", (DescriptorAttack, SelectiveAttack, ImageAttack)
+ATTACK = Kind[DescriptorAttack | SelectiveAttack | ImageAttack | PositionAttack](
+    "attack", "attacks", "feature_privacy.attacks", (DescriptorAttack, SelectiveAttack, ImageAttack, PositionAttack)
 )
 METRIC = Kind("metric", "metrics", "feature_privacy.metrics", (Metric,))
 TASK = Kind("task", "bench.tasks", "feature_privacy.tasks", (Task,))

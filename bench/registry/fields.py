@@ -11,6 +11,7 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from bench.api import Plugin
 from bench.core.exact import Exact
+from bench.registry.composed import Composed
 from bench.settings import Asset
 
 _get_hints = functools.cache(get_type_hints)  # one list of the plugins needs them hundreds of times
@@ -24,6 +25,8 @@ def resolve_types(plugin: type[Plugin]) -> dict[str, Any]:
 
 def list_assets(plugin: Plugin) -> dict[str, str]:
     """Return field name -> asset, of the fields of type Asset."""
+    if isinstance(plugin, Composed):
+        return {name: asset for part in plugin.parts for name, asset in list_assets(part).items()}
     return {name: getattr(plugin, name) for name, kind in resolve_types(type(plugin)).items() if kind is Asset}
 
 

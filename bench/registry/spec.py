@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Mapping
+import re
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from bench.api import Plugin
 from bench.core.errors import UserError, unknown_name
 from bench.core.exact import Exact
 from bench.registry import discovery, fields
+from bench.registry.composed import Composed, compose
 from bench.registry.discovery import Kind
 
 if TYPE_CHECKING:
@@ -60,9 +62,27 @@ def build(plugin: type[P], given: Mapping[str, Any]) -> P:
     return plugin(**given)
 
 
-def read(text: str, kind: Kind[P]) -> P:
-    """Return the plugin that a text specifies: `parse`, then `build`."""
-    return build(*parse(text, kind))
+def read(text: str, kind: Kind[P], defaults: Callable[[type[P]], Mapping[str, Any]] = lambda plugin: {}) -> P:
+    """Return the plugin that a text specifies: `parse`, then `build`. Defenses joined by `+` are composed.
+
+    `defaults` returns the values of fields that the text does not give, in place of the plugin's own defaults.
+
+    Raises
+    ------
+    UserError
+        as `parse` and `build`, or if two defenses of the text cannot be composed.
+    """
+    built = []
+    for part in split_parts(text) if kind is discovery.DEFENSE else [text]:
+        plugin, given = parse(part, kind)
+        built.append(build(plugin, {**defaults(plugin), **given}))
+    return built[0] if len(built) == 1 else cast(P, compose(built))  # type: ignore[arg-type]  # parts are defenses
+
+
+def split_parts(text: str) -> list[str]:
+    """Return the parts of a text at each `+` that the name of a defense follows: `epsilon=1e+1` is a number."""
+    names = "|".join(map(re.escape, discovery.discover(discovery.DEFENSE)))
+    return re.split(rf"\+(?=\s*(?:{names})\s*(?:[:+]|$))", text)
 
 
 def to_json_with_digests(plugin: Plugin, public: Public, resolved: Mapping[str, Any] | None = None) -> dict[str, Any]:
@@ -75,13 +95,17 @@ def to_json_with_digests(plugin: Plugin, public: Public, resolved: Mapping[str, 
     UserError
         if a dictionary is missing or damaged.
     """
+    if isinstance(plugin, Composed):
+        return {"name": plugin.name(), "parts": [to_json_with_digests(part, public) for part in plugin.parts]}
     overrides = dict(resolved or {})
     digests = {name: public.digest(asset) for name, asset in fields.list_assets(plugin).items() if name not in overrides}
     return to_json(plugin) | digests | overrides
 
 
 def to_json(plugin: Plugin) -> dict[str, Any]:
-    """Return name and fields of a plugin as JSON, with assets by name."""
+    """Return name and fields of a plugin as JSON, with assets by name; of a composed defense, its name and its parts."""
+    if isinstance(plugin, Composed):
+        return {"name": plugin.name(), "parts": [to_json(part) for part in plugin.parts]}
     types = fields.resolve_types(type(plugin))
     return {"name": plugin.name()} | {name: _encode(kind, getattr(plugin, name)) for name, kind in types.items()}
 

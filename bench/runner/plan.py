@@ -6,14 +6,14 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from bench.api import Attack, Dataset, Defense, Extractor, Metric, Plugin, Privacy
+from bench.api import Attack, Dataset, Defense, Extractor, Metric, Plugin, PositionAttack, Privacy
 from bench.cache import dictionary_cache, feature_cache
 from bench.codebook.public import Public
 from bench.core import environment, hashing
 from bench.core.errors import UserError
 from bench.images.samples import Images, Sample
 from bench.localization.scene_index import SceneIndex
-from bench.registry import discovery, fields, spec
+from bench.registry import composed, discovery, fields, spec
 from bench.runner import records
 from bench.runner.records import EVERY_SAMPLE, Record
 from bench.task_api import Execute, Task, execute_in_process
@@ -124,15 +124,18 @@ def build_plan(configuration: RunConfiguration, describe: Describe = environment
         "extractor": spec.to_json_with_digests(extractor, public),
     }
     metrics = (*_default_metrics(), *configuration.metrics) if task.judges_attacks else ()
+    if not any(isinstance(attack, PositionAttack) for _, attack in configuration.pairs):
+        metrics = tuple(metric for metric in metrics if metric.compares != "positions")
     if collection.scene is None:
         metrics = tuple(metric for metric in metrics if metric.compares != "views")
     metric_settings = {metric.name(): _settings(metric) for metric in metrics}
-    plugins = [plugin for pair in configuration.pairs for plugin in pair if plugin is not None]
+    attacks = [attack for _, attack in configuration.pairs if attack is not None]
+    plugins = [*attacks, *(part for defense, _ in configuration.pairs for part in composed.list_parts(defense))]
     environment_record = dict(describe([task, extractor, *plugins, *metrics]))
     experiments = []
     for defense, attack in configuration.pairs:
         defense_record = spec.to_json_with_digests(defense, public)
-        reason = task.explain_not_applicable(defense, attack, extractor, public)
+        reason = _explain_hidden_positions(task, defense) or task.explain_not_applicable(defense, attack, extractor, public)
         attack_record = _attack_record(task, defense, attack, extractor, public, reason)
         experiment_id = records.experiment_id(
             spec.to_json(task), defense_record, attack_record, dataset_record, seed, metric_settings
@@ -147,7 +150,7 @@ def build_plan(configuration: RunConfiguration, describe: Describe = environment
             "metric_settings": metric_settings,
             "seed": seed,
             "sources": {
-                "defense": environment.hash_plugin_file(defense),
+                "defense": _hash_defense(defense),
                 "attack": attack and environment.hash_plugin_file(attack),
             },
             "experiment_id": experiment_id,
@@ -157,6 +160,20 @@ def build_plan(configuration: RunConfiguration, describe: Describe = environment
         experiments.append(Experiment(defense, attack, defense.privacy(public), metadata, reason))
     unique = {experiment.metadata["experiment_id"]: experiment for experiment in experiments}
     return Plan(configuration, task, tuple(unique.values()), collection.samples, hashes, extractor, metrics, public, seed)
+
+
+def _explain_hidden_positions(task: Task, defense: Defense) -> str | None:
+    """Return the reason if the task needs other positions than the defense releases; None if it accepts them."""
+    if issubclass(defense.positions, task.accepts_positions):
+        return None
+    accepted = " or ".join(kind.__name__ for kind in task.accepts_positions)
+    return f"{task.name()} needs {accepted}; {defense.name()} releases {defense.positions.__name__}"
+
+
+def _hash_defense(defense: Defense) -> str | None:
+    """Return the hash of a defense's file, or of those of its parts."""
+    files = [environment.hash_plugin_file(part) for part in composed.list_parts(defense)]
+    return files[0] if len(files) == 1 else hashing.digest(files)
 
 
 def _default_metrics() -> Iterator[Metric]:

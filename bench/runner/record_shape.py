@@ -55,6 +55,13 @@ def is_plugin(value: Any) -> bool:
     return _is_object(value, {"name": _is_text}, lambda inner: _is_scalar(inner) or is_plugin(inner))
 
 
+def _is_defense(value: Any) -> bool:
+    """Return whether a value is the configuration of a defense, or of a composed one: its name, and its parts."""
+    if isinstance(value, dict) and isinstance(value.get("parts"), list):
+        return value.keys() == {"name", "parts"} and _is_text(value["name"]) and _is_list(value["parts"], is_plugin)
+    return is_plugin(value)
+
+
 def _is_object(value: Any, required: Mapping[str, Check], others: Check, optional: Mapping[str, Check] | None = None) -> bool:
     """Return whether a value is an object with the required entries; `others` checks those that no name is given for."""
     if not isinstance(value, dict) or not required.keys() <= value.keys():
@@ -92,7 +99,7 @@ _ESTIMATES = {
 }
 REQUIRED: Mapping[str, Check] = {
     "task": _is_text,
-    "defense": is_plugin,
+    "defense": _is_defense,
     "attack": _optional(is_plugin),
     "dataset": lambda value: _is_object(value, _DATASET, _anything, {"spec": _optional(is_plugin)}),
     "metric_settings": lambda value: _is_object(value, {}, lambda inner: isinstance(inner, dict)),

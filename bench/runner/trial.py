@@ -8,6 +8,7 @@ keys of `provenance` enter that randomness and the keys of caches. They are data
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import functools
 import io
 import time
@@ -27,7 +28,7 @@ from bench.core.randomness import derive_generator
 from bench.images import samples
 from bench.images.photographs import Source
 from bench.images.samples import ImageSource, Sample
-from bench.mechanisms import composition
+from bench.mechanisms import composition, protection
 from bench.registry import spec
 from bench.runner.other_releases import ReleasePool
 from bench.runner.plan import Experiment, Plan
@@ -128,8 +129,10 @@ class TrialRunner:
         experiment, images = self._find_experiment(defense), []
         for source, extracted in zip(sample.images, extract_sample(self.plan, sample), strict=True):
             content = self.plan.hashes[sample.name] if len(sample.images) == 1 else source.content_hash()
-            release = self.protect(experiment, extracted.secret, content)
-            images.append(ProtectedImage(**vars(extracted), release=release))
+            rng = derive_generator("order", self.plan.seed, content, experiment.metadata["defense"])
+            shuffled = dataclasses.replace(extracted, secret=protection.hide_order(extracted.secret, defense, rng))
+            release = self.protect(experiment, shuffled.secret, content)
+            images.append(ProtectedImage(**vars(shuffled), release=release))
         return tuple(images)
 
     def _build_pool(self, defense: Defense) -> ReleasePool:

@@ -25,7 +25,7 @@ from bench.images.scene import SceneImage
 from bench.localization import map_matching, pose
 from bench.localization.server import Server
 from bench.task_api import REJECTED, Outcome, Task, Trial
-from bench.types import Features, Indices
+from bench.types import Features, Indices, Lines, Points, Positions
 
 # Largest errors of a localized pose: units of length and degrees (Sattler et al., CVPR 2018).
 THRESHOLDS = {"0.25m_2deg": (0.25, 2.0), "0.5m_5deg": (0.5, 5.0), "5m_10deg": (5.0, 10.0)}
@@ -43,6 +43,7 @@ class Localization(Task):
     judges_attacks: ClassVar[bool] = False
     needs_scene: ClassVar[bool] = True
     needs_map: ClassVar[bool] = True
+    accepts_positions: ClassVar[tuple[type[Positions], ...]] = (Points, Lines)
 
     # auto: the best matcher for the release among those that do not lift references
     matcher: Literal["auto", "vocabulary", "noisy-nn", "mutual-nn", "point-to-subspace", "subspace-to-subspace"] = "auto"

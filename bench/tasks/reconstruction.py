@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from bench import scene_views
-from bench.api import Attack, Dataset, Defense, Extractor, ImageAttack, LocalMetric, Metric, Selection, View
+from bench.api import Attack, Dataset, Defense, Extractor, ImageAttack, LocalMetric, Metric, PositionAttack, Selection, View
 from bench.cache import attack_cache
 from bench.codebook.public import Public
 from bench.codebook.true_words import find_true_candidates, find_true_words
@@ -20,6 +20,7 @@ from bench.images import samples
 from bench.images.samples import Collection, Images
 from bench.images.scene import Mask
 from bench.registry import discovery, fields, spec
+from bench.registry.composed import Composed
 from bench.task_api import Outcome, Task, Trial
 from bench.threat_model import (
     DefenseDatabase,
@@ -29,9 +30,10 @@ from bench.threat_model import (
     PublicDatabase,
     RepeatedReleases,
     ServerMap,
+    TrueNeighbours,
     TrueWords,
 )
-from bench.types import Descriptors, Floats, Points, WordSets
+from bench.types import Descriptors, Floats, Indices, Points, Positions, WordSets
 
 RELEASES = {OtherReleases, RepeatedReleases}  # available for every defense
 
@@ -44,6 +46,7 @@ class Reconstruction(Task):
     """
 
     judges_attacks = True
+    accepts_positions = (Positions,)  # the attack decides
 
     inverter: str = "dia"  # an attack that reconstructs images
 
@@ -60,6 +63,8 @@ class Reconstruction(Task):
         served: set[type[Knowledge]] = {ServerMap} if public.scene_index is not None else set()
         if defense.dictionary_field is not None and issubclass(defense.releases, WordSets):
             served.add(TrueWords)
+        if not issubclass(defense.positions, Points):
+            served.add(TrueNeighbours)
         missing = attack.needs - offer_knowledge(attack, defense, public).keys() - RELEASES - served
         if missing:
             wanted = " and ".join(sorted(need.description for need in missing))
@@ -75,12 +80,10 @@ class Reconstruction(Task):
         digests = dict(attack.assets(defense, extractor, public))
         if isinstance(attack, ImageAttack):
             return digests
-        inverter, undefended, reason = self._load_inverter(extractor, public)
+        inverter, left, reason = self._load_inverter(attack, defense, extractor, public)
         if reason is not None:
             return digests | {"inversion": None}
-        return digests | {
-            "inversion": spec.to_json_with_digests(inverter, public, inverter.assets(undefended, extractor, public))
-        }
+        return digests | {"inversion": spec.to_json_with_digests(inverter, public, inverter.assets(left, extractor, public))}
 
     def evaluate(self, trial: Trial) -> Outcome:
         attack = trial.attack
@@ -88,8 +91,10 @@ class Reconstruction(Task):
             raise SampleError("reconstruction needs an attack")
         if isinstance(attack, ImageAttack):
             return compute_metrics(trial, None, reconstruct_image(attack, build_view(trial), trial))
+        if isinstance(attack, PositionAttack):
+            return self._evaluate_positions(attack, trial)
         recovered = attack_cache.recover_cached(attack, trial, build_view(trial))
-        inverter, undefended, reason = self._load_inverter(trial.extractor, trial.public)
+        inverter, undefended, reason = self._load_inverter(attack, trial.defense, trial.extractor, trial.public)
         if reason is not None:
             outcome = compute_metrics(trial, recovered.selection, None, (*recovered.notes, f"no image: {reason}"))
             return dataclasses.replace(outcome, saved_seconds=recovered.saved_seconds)
@@ -101,13 +106,33 @@ class Reconstruction(Task):
         outcome = compute_metrics(trial, recovered.selection, reconstruct_image(inverter, view, trial), recovered.notes)
         return dataclasses.replace(outcome, saved_seconds=recovered.saved_seconds)
 
-    def _load_inverter(self, extractor: Extractor, public: Public) -> tuple[ImageAttack, Defense, str | None]:
-        """Return the attack that inverts raw descriptors, its defense, and the reason if it does not apply."""
+    def _evaluate_positions(self, attack: PositionAttack, trial: Trial) -> Outcome:
+        """Score the recovered positions, and the image that the inverter reconstructs from them and the released descriptors."""
+        view = build_view(trial)
+        with wrap_plugin_errors(f"plugin {attack.name()}"):
+            located = trial.execute(attack.locate, view, trial.rng)
+            attack_cache.check_array(located, (len(trial.release), 2))
+        release = dataclasses.replace(trial.release, positions=Points(keypoints=located))
+        inverter, left, reason = self._load_inverter(attack, trial.defense, trial.extractor, trial.public)
+        if reason is not None:
+            return compute_metrics(trial, None, None, (*map(str, view.notes), f"no image: {reason}"), located)
+        shown = build_view(dataclasses.replace(trial.with_release(release), attack=inverter, defense=left))
+        return compute_metrics(trial, None, reconstruct_image(inverter, shown, trial), tuple(map(str, view.notes)), located)
+
+    def _load_inverter(
+        self, attack: Attack, defense: Defense, extractor: Extractor, public: Public
+    ) -> tuple[ImageAttack, Defense, str | None]:
+        """Return the attack that inverts what an attack recovers, the defense that is left, and the reason if it does not apply.
+
+        Recovered descriptors are raw. Recovered positions leave the descriptors of a composed defense protected.
+        """
         inverter = spec.read(self.inverter, discovery.ATTACK)
         if not isinstance(inverter, ImageAttack):
             raise UserError(f"reconstruction: inverter must reconstruct images, and {inverter.name()} does not")
-        undefended = discovery.load_plugin(discovery.DEFENSE, "none")()
-        return inverter, undefended, inverter.explain_not_applicable(undefended, extractor, public)
+        left: Defense = discovery.load_plugin(discovery.DEFENSE, "none")()
+        if isinstance(attack, PositionAttack) and isinstance(defense, Composed):
+            left = defense.descriptors
+        return inverter, left, inverter.explain_not_applicable(left, extractor, public)
 
 
 def offer_knowledge(attack: Attack, defense: Defense, public: Public) -> dict[type[Knowledge], Callable[[], Knowledge]]:
@@ -132,6 +157,7 @@ def build_view(trial: Trial) -> View:
         RepeatedReleases: lambda: RepeatedReleases(releases=copy.deepcopy(trial.repeats)),
         ServerMap: lambda: _build_server_map(trial),
         TrueWords: lambda: _find_true_words(trial),
+        TrueNeighbours: lambda: TrueNeighbours(order=order_by_distance(trial.secret.keypoints)),
     }
     return View(
         release=copy.deepcopy(trial.release),  # an attack cannot change the input of the next attack
@@ -152,6 +178,13 @@ def _find_true_words(trial: Trial) -> TrueWords:
     return TrueWords(candidates=find_true_candidates(trial.release, true))
 
 
+def order_by_distance(keypoints: Floats) -> Indices:
+    """Return the other keypoints of each keypoint, nearest first. (N, 2) -> (N, N − 1)"""
+    distances = np.linalg.norm(keypoints[:, None] - keypoints[None], axis=2)
+    np.fill_diagonal(distances, -1)
+    return np.argsort(distances, axis=1, kind="stable")[:, 1:]
+
+
 def reconstruct_image(attack: ImageAttack, view: View, trial: Trial) -> Floats:
     """Run the attack, check its image, and return it. -> (H, W, 3)"""
     with wrap_plugin_errors(f"plugin {attack.name()}"):
@@ -163,8 +196,10 @@ def reconstruct_image(attack: ImageAttack, view: View, trial: Trial) -> Floats:
     return image
 
 
-def compute_metrics(trial: Trial, selection: Selection | None, image: Floats | None, notes: tuple[str, ...] = ()) -> Outcome:
-    """Compute all metrics; None if the image or the descriptors are missing. With a foreground, also those of both parts."""
+def compute_metrics(
+    trial: Trial, selection: Selection | None, image: Floats | None, notes: tuple[str, ...] = (), located: Floats | None = None
+) -> Outcome:
+    """Compute all metrics; None if what they compare is missing. With a foreground, also those of both parts."""
     values: dict[str, float | None] = {}
     truth = (trial.pixels() / 255.0).astype(np.float32)
     for metric in trial.metrics:
@@ -173,6 +208,8 @@ def compute_metrics(trial: Trial, selection: Selection | None, image: Floats | N
         elif metric.compares == "views":
             views = None if image is None else list_views(trial)
             values[metric.name()] = None if image is None or views is None else _compute_metric(metric, views, image)
+        elif metric.compares == "positions":
+            values[metric.name()] = None if located is None else _compute_metric(metric, trial.secret.keypoints, located)
         else:
             values[metric.name()] = (
                 None

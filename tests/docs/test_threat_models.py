@@ -20,7 +20,7 @@ ATTACKS = {
 
 def read_rows(page: str) -> dict[str, list[str]]:
     """Return the columns release, knowledge and recovers of each attack's row."""
-    rows = re.findall(r"^\| \[`([a-z]+)`\]\(#\1\) \| (.+?) \| (.+?) \| (.+?) \|", page, re.MULTILINE)
+    rows = re.findall(r"^\| \[`([a-z-]+)`\]\(#\1\) \| (.+?) \| (.+?) \| (.+?) \|", page, re.MULTILINE)
     return {name: columns for name, *columns in rows}
 
 

@@ -11,6 +11,10 @@ from skimage import metrics as reference
 from bench.api import Metric
 from bench.images import photographs
 from metrics import angle, face, identified, l2, mae, mse, psnr, recovered, ssim
+from metrics.position_auc_5 import PositionAUC5
+from metrics.position_auc_10 import PositionAUC10
+from metrics.position_auc_25 import PositionAUC25
+from metrics.position_error import PositionError
 
 IMAGES = [face.PLUGIN, identified.PLUGIN, mae.PLUGIN, mse.PLUGIN, psnr.PLUGIN, ssim.PLUGIN]
 DESCRIPTORS = [angle.PLUGIN, l2.PLUGIN, recovered.PLUGIN]
@@ -294,3 +298,17 @@ def test_invalid_descriptors_are_refused(plugin: type[Metric]) -> None:
         plugin()(good, nan)
     with pytest.raises(ValueError, match="truth: descriptors must be finite"):
         plugin()(nan, good)
+
+
+def test_accuracy_of_positions_is_the_area_under_the_curve() -> None:
+    rng = np.random.default_rng(0)
+    truth = rng.uniform(0, 100, (400, 2)).astype(np.float32)
+    estimate = truth + rng.normal(0, 6, truth.shape).astype(np.float32)
+    errors = np.linalg.norm(truth - estimate, axis=1)
+    for metric in (PositionAUC5(), PositionAUC10(), PositionAUC25()):
+        distances = np.linspace(0, metric.reach, 20_001)
+        within = np.searchsorted(np.sort(errors), distances, side="right") / len(errors)
+        assert metric(truth, estimate) == pytest.approx(np.trapezoid(within, distances) / metric.reach, abs=1e-3)
+        assert metric(truth, truth + np.float32(metric.reach)) == 0
+    assert PositionError()(truth, estimate) == pytest.approx(np.median(errors), rel=1e-5)
+    assert PositionError()(truth, truth + np.float32([3, 4])) == pytest.approx(5, rel=1e-5)

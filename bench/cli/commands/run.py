@@ -97,10 +97,11 @@ def _read_defense(text: str, task: Task) -> Defense:
     from bench.registry import discovery, spec
     from bench.settings import Asset
 
-    plugin, given = spec.parse(text, discovery.DEFENSE)
-    if task.needs_scene and plugin.dictionary_field is not None:
-        given.setdefault(plugin.dictionary_field, Asset(REFERENCES))
-    return spec.build(plugin, given)
+    def choose_dictionary(plugin: type[Defense]) -> dict[str, Asset]:
+        field = plugin.dictionary_field
+        return {field: Asset(REFERENCES)} if task.needs_scene and field is not None else {}
+
+    return spec.read(text, discovery.DEFENSE, choose_dictionary)
 
 
 def _read_metric(text: str) -> Metric:

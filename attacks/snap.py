@@ -1,0 +1,77 @@
+"""Snap: the server localizes the release, and the keypoints that it verifies fall onto known points of its map.
+
+Source: not in the paper.
+
+Method:
+
+1. Localize the release in the server's map from its lines.
+2. The position of a verified keypoint is the projection of its point.
+3. The other keypoints are estimated as by `neighbourhood`, with the verified ones as neighbours at known positions.
+
+Knowledge: the server's map, and the model of neighbours.
+
+Limits: a server that can localize a release knows the positions of its inliers, whatever hides them. Objects in front of the
+mapped scene have no inliers, and only their neighbours reveal them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from bench.api import Defense, Extractor, PositionAttack, View
+from bench.codebook.public import Public
+from bench.core.errors import SampleError
+from bench.localization import map_matching
+from bench.positions import neighbour_model
+from bench.positions.neighbourhood import recover_positions
+from bench.positions.prediction import predict_neighbours
+from bench.threat_model import PublicAssets, ServerMap
+from bench.types import Descriptors, Floats, Lines, WordSets
+
+
+@dataclass(frozen=True, kw_only=True)
+class Snap(PositionAttack):
+    """Localizes the release, projects the points of verified keypoints, and estimates the others from their neighbours."""
+
+    accepts = (Descriptors, WordSets)
+    needs = frozenset({PublicAssets, ServerMap})
+
+    neighbours: int = 30
+    reach: float = 15.0  # pixels, as of `neighbourhood`
+    retrieved: int = 20  # references that a query is matched with
+    trials: int = 30_000  # maximum number of RANSAC's trials
+
+    def explain_incompatible(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
+        trained = neighbour_model.load().meta["extractor"]
+        if extractor.name() != trained:
+            return f"the model of neighbours was trained for {trained}, not {extractor.name()}"
+        return None
+
+    def assets(self, defense: Defense, extractor: Extractor, public: Public) -> Mapping[str, str]:
+        return {"neighbour_model": neighbour_model.load().digest}
+
+    def locate(self, view: View, rng: np.random.Generator) -> Floats:
+        release, server = view.release, view.know(ServerMap).server
+        if not isinstance(release.positions, Lines):
+            raise TypeError(f"snap reads Lines, got {type(release.positions).__name__}")
+        matcher = map_matching.select_matcher(view.defense)
+        if matcher is None:
+            raise SampleError(f"no matcher supports {type(release).__name__}")
+        references = server.retrieve_by_release(release, view.defense, self.retrieved)
+        result = server.localize(release, view.defense, references, matcher, self.trials, int(rng.integers(2**31)))
+        known = np.full((len(release), 2), np.nan)
+        if result.estimate is not None:
+            pairs, inliers = result.correspondences, result.estimate.inliers
+            in_camera = result.estimate.cam_from_world * server.scene_index.map.xyz[pairs.points[inliers]]
+            known[pairs.keypoints[inliers]] = server.camera.img_from_cam(in_camera)
+        verified = ~np.isnan(known[:, 0])
+        view.notes.append(f"{verified.sum()} keypoints verified")
+        near, weights = predict_neighbours(release, view.defense, view.know(PublicAssets).assets, self.neighbours)
+        positions = recover_positions(release.positions.lines, near, weights, release.size, self.reach, known)
+        return np.where(verified[:, None], known, positions).astype(np.float32)
+
+
+PLUGIN = Snap

@@ -1,0 +1,18 @@
+"""Accuracy of recovered positions, up to 5 pixels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from bench.positions.accuracy import PositionAUC
+
+
+@dataclass(frozen=True, kw_only=True)
+class PositionAUC5(PositionAUC):
+    """Area under the curve of the fraction of keypoints recovered within a distance, up to 5 pixels."""
+
+    reach: ClassVar[float] = 5.0
+
+
+PLUGIN = PositionAUC5

@@ -1,0 +1,130 @@
+"""Measures defenses that hide positions, alone and together with a descriptor defense, and writes docs/results/geometry.md.
+
+    python tools/measure_geometry.py --work work/geometry
+
+1. Attacks on positions, on the built-in photographs: the error of positions, and the image that follows.
+2. Localization from lines and from points in a small gallery, with the same keypoints and the same limit of trials.
+
+Records in WORK are reused, so an interrupted run resumes.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from result_page import format_interval, write_page
+
+import bench
+from bench.core.table import markdown_row
+from bench.registry import discovery, spec
+from bench.runner.records import Record
+from leaderboard.intervals import interval
+
+TITLE = """# Defenses that hide positions
+
+Releases of the seven built-in photographs, 256 by 256 pixels, upright SIFT, seed 0. `lines` releases a random line through each
+keypoint, `permutation` one of its two coordinates. Keypoints are in random order. In brackets: 95% intervals of Student's t over
+photographs.
+
+`neighbourhood-oracle` knows the true neighbours, which no attacker does. `neighbourhood` predicts them from the released
+descriptors by a small model; its settings were chosen on `tune.txt`. The image is reconstructed by `dia` from the recovered
+positions, with the network that was trained for true positions. It is not adapted to errors of positions, so the scores of images
+are no upper bound of the leakage.
+"""
+PLAIN = {"none": ("dia", "keypoints")}
+HIDDEN = ("lines", "permutation")
+ON_HIDDEN = ("neighbourhood-oracle", "neighbourhood", "density", "blank")
+COMPOSED = ("lines+ldp:epsilon=16", "lines+ldp:epsilon=10")
+ON_COMPOSED = ("neighbourhood-oracle", "neighbourhood")
+SHOWN = {"position-error": 1, "ssim": 3, "psnr": 2, "identified": 3}  # metric -> digits
+SCENE = "gallery:views=40,queries=12,rooms=2"
+LOCALIZED = ("none", "lines", "permutation")
+RECALLS = {"recall_0.25m_2deg": "0.25 m, 2°", "recall_0.5m_5deg": "0.5 m, 5°", "recall_5m_10deg": "5 m, 10°"}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--work", type=Path, required=True, help="folder of records, reused between runs")
+    args = parser.parse_args()
+    args.work.mkdir(parents=True, exist_ok=True)
+    pairs = [
+        *((defense, attack) for defense, attacks in PLAIN.items() for attack in attacks),
+        *((defense, attack) for defense in HIDDEN for attack in ON_HIDDEN),
+        *((defense, attack) for defense in COMPOSED for attack in ON_COMPOSED),
+    ]
+    attacked = {pair: attack_positions(*pair, args.work / "attacks") for pair in pairs}
+    localized = {defense: localize(defense, args.work / "localization") for defense in LOCALIZED}
+    records = [record for some in (*attacked.values(), *localized.values()) for record in some]
+    parts = [TITLE, write_attacks(attacked), write_localization(localized)]
+    write_page("geometry.md", "\n".join(parts), records)
+
+
+def attack_positions(defense: str, attack: str, work: Path) -> list[Record]:
+    """Return the records of one attack on one defense."""
+    print(defense, attack, flush=True)
+    return bench.run([spec.read(defense, discovery.DEFENSE)], [spec.read(attack, discovery.ATTACK)], out=work)
+
+
+def localize(defense: str, work: Path) -> list[Record]:
+    """Return the records of the localization of one defense's releases."""
+    print("localization", defense, flush=True)
+    return bench.run(
+        [spec.read(defense, discovery.DEFENSE)],
+        task=spec.read("localization", discovery.TASK),
+        dataset=spec.read(SCENE, discovery.DATASET),
+        out=work,
+    )
+
+
+def write_attacks(results: Mapping[tuple[str, str], Sequence[Record]]) -> str:
+    """Write the table of attacks."""
+    lines = [
+        "## Attacks on positions",
+        "",
+        "*position error*: median distance of a photograph's keypoints to their recovered positions, in pixels.",
+        "",
+        markdown_row(("defense", "attack", "position error", "SSIM", "PSNR", "identified")),
+        markdown_row(["---"] * 6),
+    ]
+    for (defense, attack), records in results.items():
+        values = {metric: list_values(records, metric) for metric in SHOWN}
+        columns = [
+            format_interval(interval(values[metric]), digits) if len(values[metric]) else "n/a"
+            for metric, digits in SHOWN.items()
+        ]
+        lines.append(markdown_row((f"`{defense}`", f"`{attack}`", *columns)))
+    return "\n".join([*lines, ""])
+
+
+def write_localization(results: Mapping[str, Sequence[Record]]) -> str:
+    """Write the table of localization."""
+    lines = [
+        "## Localization",
+        "",
+        f"Dataset `{SCENE}`: a small scene, so differences of a few queries mean nothing. Fraction of queries within the "
+        "thresholds, and medians over the localized queries.",
+        "",
+        markdown_row(
+            ("defense", "queries", "localized", *RECALLS.values(), "error in m", "error in degrees", "matches", "trials")
+        ),
+        markdown_row(["---"] * 10),
+    ]
+    for defense, records in results.items():
+        errors = [list_values(records, metric) for metric in ("translation_error", "rotation_error")]
+        recalls = [f"{list_values(records, metric).mean():.2f}" for metric in RECALLS]
+        medians = [f"{np.median(each):.3f}" if len(each) else "n/a" for each in errors]
+        counts = [f"{np.median(list_values(records, metric)):.0f}" for metric in ("matches", "trials")]
+        lines.append(markdown_row((f"`{defense}`", len(records), len(errors[0]), *recalls, *medians, *counts)))
+    return "\n".join([*lines, ""])
+
+
+def list_values(records: Sequence[Record], metric: str) -> np.ndarray:
+    """List the values of a metric. -> (samples,), without samples that have none"""
+    return np.array([value for record in records if (value := record["metrics"].get(metric)) is not None])
+
+
+if __name__ == "__main__":
+    main()
