@@ -36,7 +36,7 @@ class NeighbourhoodOracle(PositionAttack):
         if not isinstance(positions, Lines):
             raise TypeError(f"neighbourhood-oracle reads Lines, got {type(positions).__name__}")
         near = view.know(TrueNeighbours).order[:, : self.neighbours]
-        return recover_positions(positions.lines, near, np.ones(near.shape), view.release.size)
+        return recover_positions(positions.lines, near, np.ones(near.shape, np.float32), view.release.size)
 
 
 PLUGIN = NeighbourhoodOracle

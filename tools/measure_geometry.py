@@ -41,7 +41,7 @@ COMPOSED = ("lines+ldp:epsilon=16", "lines+ldp:epsilon=10")
 ON_COMPOSED = ("neighbourhood-oracle", "neighbourhood")
 SHOWN = {"position-error": 1, "ssim": 3, "psnr": 2, "identified": 3}  # metric -> digits
 SCENE = "gallery:views=40,queries=12,rooms=2"
-LOCALIZED = ("none", "lines", "permutation", "ldp:words=8000,dictionary=references", "lines+ldp:words=8000,dictionary=references")
+LOCALIZED = ("none", "lines", "permutation")
 RECALLS = {"recall_0.25m_2deg": "0.25 m, 2°", "recall_0.5m_5deg": "0.5 m, 5°", "recall_5m_10deg": "5 m, 10°"}
 NOTES = Path(__file__).with_name("geometry_notes.md")
 

@@ -94,10 +94,10 @@ def _find_planes(lines: Doubles, camera: pycolmap.Camera) -> tuple[Doubles, Doub
     normal, middle = lines[:, :2], np.array([camera.width, camera.height]) / 2
     foot = middle - (normal @ middle + lines[:, 2])[:, None] * normal  # (C, 2) of the line, nearest to the middle
     along = np.stack([-normal[:, 1], normal[:, 0]], axis=1) * (min(camera.width, camera.height) / 4)
-    ends = [
-        np.column_stack([camera.cam_from_img(each), np.ones(len(lines))]) for each in (foot - along, foot + along)
-    ]  # 2 × (C, 3)
-    planes = np.cross(*ends)
+    one, other = (
+        np.column_stack([np.asarray(camera.cam_from_img(each)), np.ones(len(lines))]) for each in (foot - along, foot + along)
+    )
+    planes: Doubles = np.cross(one, other)
     planes /= np.linalg.norm(planes, axis=1, keepdims=True)
     return planes, camera.mean_focal_length() / np.linalg.norm(planes[:, :2], axis=1)
 

@@ -64,15 +64,15 @@ class NeighbourModel:
             for other in range(m):
                 logs = (embedded[:, one] * self.weights["scale"]) @ embedded[:, other].T + self.weights["bias"]
                 ratios += np.float32(chance**2) * np.exp(np.clip(logs, -MAX_LOG_RATIO, MAX_LOG_RATIO))
-        logs = np.log(ratios)
-        np.fill_diagonal(logs, -np.inf)
-        return logs
+        result: Floats = np.log(ratios)
+        np.fill_diagonal(result, -np.inf)
+        return result
 
 
 def select_neighbours(log_ratios: Floats, count: int) -> tuple[Indices, Floats]:
     """Return the likeliest neighbours of each keypoint and their log-ratios. -> (N, k) twice, k = min(count, N − 1)"""
     count = min(count, len(log_ratios) - 1)
-    order = np.argsort(-log_ratios, axis=1, kind="stable")[:, :count]
+    order: Indices = np.argsort(-log_ratios, axis=1, kind="stable")[:, :count]
     return order, np.take_along_axis(log_ratios, order, axis=1)
 
 
