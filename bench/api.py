@@ -257,7 +257,7 @@ class Metric(Plugin, ABC):
     """A pure function of the truth and an estimate."""
 
     # "views" compares a reconstruction with other views of its scene, and is computed on datasets alone.
-    # "positions" compares keypoints, and is computed only in runs with an attack on positions.
+    # "positions" compares keypoints, and is computed only for defenses that hide positions.
     compares: ClassVar[Literal["images", "descriptors", "views", "positions"]]
     unit: ClassVar[str]
     range: ClassVar[tuple[float, float]]

@@ -13,8 +13,8 @@ Guarantee: none. The other coordinate stays in the clear.
 
 Limits: as those of `lines`, with lines that are parallel to the sides of the image. The exchanged coordinates are those of other
 keypoints, so each true coordinate is among the released ones. Keypoints of a pair with an equal coordinate may stay in place.
-Differences to the source, of which only the abstract and descriptions by others were read: there, the positions are recovered
-during pose estimation. Here, localization reads the lines alone.
+The construction follows the title and descriptions of the source. Its text was not available, so details may differ. Here,
+localization reads the lines alone.
 """
 
 from __future__ import annotations

@@ -54,7 +54,9 @@ def main() -> None:
     if not (args.work / "walk").exists():
         scene = Walk(views=VIEWS).scene()
         scene_export.write(Scene(name=scene.name, references=(), queries=scene.queries), "colmap", args.work / "walk")
-    rows = [("defense", "attack", "keypoints", "images in the model", "points", "reprojection error in pixels")]
+    rows: list[tuple[str, ...]] = [
+        ("defense", "attack", "keypoints", "images in the model", "points", "reprojection error in pixels")
+    ]
     rows.append(("---",) * len(rows[0]))
     for defense, attack in EXPORTS:
         row = (f"`{defense}`", f"`{attack}`" if attack else "none", *reconstruct(args.work, defense, attack))

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from bench.api import Attack, Dataset, Defense, Extractor, Metric, Plugin, PositionAttack, Privacy
+from bench.api import Attack, Dataset, Defense, Extractor, Metric, Plugin, Privacy
 from bench.cache import dictionary_cache, feature_cache
 from bench.codebook.public import Public
 from bench.core import environment, hashing
@@ -18,6 +18,7 @@ from bench.runner import records
 from bench.runner.records import EVERY_SAMPLE, Record
 from bench.task_api import Execute, Task, execute_in_process
 from bench.threat_model import ServerMap
+from bench.types import Points
 
 Describe = Callable[[Iterable[object]], Mapping[str, Any]]  # plugins -> the environment that executes them
 
@@ -124,17 +125,15 @@ def build_plan(configuration: RunConfiguration, describe: Describe = environment
         "extractor": spec.to_json_with_digests(extractor, public),
     }
     metrics = (*_default_metrics(), *configuration.metrics) if task.judges_attacks else ()
-    if not any(isinstance(attack, PositionAttack) for _, attack in configuration.pairs):
-        metrics = tuple(metric for metric in metrics if metric.compares != "positions")
     if collection.scene is None:
         metrics = tuple(metric for metric in metrics if metric.compares != "views")
-    metric_settings = {metric.name(): _settings(metric) for metric in metrics}
     attacks = [attack for _, attack in configuration.pairs if attack is not None]
     plugins = [*attacks, *(part for defense, _ in configuration.pairs for part in composed.list_parts(defense))]
     environment_record = dict(describe([task, extractor, *plugins, *metrics]))
     experiments = []
     for defense, attack in configuration.pairs:
         defense_record = spec.to_json_with_digests(defense, public)
+        metric_settings = {metric.name(): _settings(metric) for metric in select_metrics(metrics, defense)}
         reason = _explain_hidden_positions(task, defense) or task.explain_not_applicable(defense, attack, extractor, public)
         attack_record = _attack_record(task, defense, attack, extractor, public, reason)
         experiment_id = records.experiment_id(
@@ -160,6 +159,11 @@ def build_plan(configuration: RunConfiguration, describe: Describe = environment
         experiments.append(Experiment(defense, attack, defense.privacy(public), metadata, reason))
     unique = {experiment.metadata["experiment_id"]: experiment for experiment in experiments}
     return Plan(configuration, task, tuple(unique.values()), collection.samples, hashes, extractor, metrics, public, seed)
+
+
+def select_metrics(metrics: Iterable[Metric], defense: Defense) -> tuple[Metric, ...]:
+    """Return the metrics of a defense, by the defense alone: an experiment is the same whatever else a run has."""
+    return tuple(metric for metric in metrics if metric.compares != "positions" or not issubclass(defense.positions, Points))
 
 
 def _explain_hidden_positions(task: Task, defense: Defense) -> str | None:

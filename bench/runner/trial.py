@@ -31,7 +31,7 @@ from bench.images.samples import ImageSource, Sample
 from bench.mechanisms import composition, protection
 from bench.registry import spec
 from bench.runner.other_releases import ReleasePool
-from bench.runner.plan import Experiment, Plan
+from bench.runner.plan import Experiment, Plan, select_metrics
 from bench.runner.records import EVERY_SAMPLE, Record, seal
 from bench.task_api import ExtractedImage, Outcome, ProtectedImage, Trial, execute_in_process
 from bench.types import Bytes, Features, Release
@@ -98,7 +98,7 @@ class TrialRunner:
             attack=attack,
             extractor=plan.extractor,
             public=plan.public,
-            metrics=plan.metrics,
+            metrics=select_metrics(plan.metrics, experiment.defense),
             rng=derive_generator("attack", plan.seed, content, *configurations, configuration),
             others=self._pool(experiment.defense).without(sample.name),
             repeats=tuple(

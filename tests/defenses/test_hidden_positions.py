@@ -13,7 +13,7 @@ from bench.mechanisms.protection import hide_order
 from bench.positions.lines import draw_lines
 from bench.registry.composed import Composed
 from bench.testing import are_equal, check_defense
-from bench.types import Descriptors, Features, Lines, Permuted, Points, Positions
+from bench.types import Descriptors, Features, Floats, Lines, Permuted, Points, Positions
 from defenses.ldp import LDP
 from defenses.lines import RandomLines
 from defenses.none import Undefended
@@ -24,8 +24,14 @@ def protect(defense: Defense, secret: Features, seed: int = 0) -> Positions:
     return defense.protect(secret, Public(), np.random.default_rng(seed)).positions
 
 
+def protect_lines(secret: Features, seed: int = 0) -> Floats:
+    positions = protect(RandomLines(), secret, seed)
+    assert isinstance(positions, Lines)
+    return positions.lines
+
+
 def test_directions_of_lines_are_uniform() -> None:
-    lines = np.concatenate([protect(RandomLines(), draw_features(100), seed).lines for seed in range(50)])  # type: ignore[attr-defined]
+    lines = np.concatenate([protect_lines(draw_features(100), seed) for seed in range(50)])
     angles = np.arctan2(lines[:, 1], lines[:, 0]) % np.pi
     counts = np.histogram(angles, bins=10, range=(0, np.pi))[0]
     assert (np.abs(counts - 500) < 5 * np.sqrt(500 * 0.9)).all()
@@ -33,11 +39,10 @@ def test_directions_of_lines_are_uniform() -> None:
 
 def test_a_line_depends_on_the_distance_alone() -> None:
     secret = draw_features(20)
-    lines = protect(RandomLines(), secret)
-    assert isinstance(lines, Lines)
-    along = np.stack([-lines.lines[:, 1], lines.lines[:, 0]], axis=1)
+    lines = protect_lines(secret)
+    along = np.stack([-lines[:, 1], lines[:, 0]], axis=1)
     moved = Features(keypoints=secret.keypoints + 30 * along, descriptors=secret.descriptors, codes=None, size=secret.size)
-    np.testing.assert_allclose(protect(RandomLines(), moved).lines, lines.lines, atol=1e-4)  # type: ignore[attr-defined]
+    np.testing.assert_allclose(protect_lines(moved), lines, atol=1e-4)
 
 
 @pytest.mark.parametrize("count", [2, 3, 8, 9])
@@ -45,16 +50,16 @@ def test_pairs_exchange_one_coordinate(count: int) -> None:
     secret = draw_features(count)
     released = protect(Permutation(), secret)
     assert isinstance(released, Permuted)
-    kept = released.points == secret.keypoints
-    assert (kept.sum(axis=1) == 1).all()
+    unchanged = released.points == secret.keypoints
+    assert (unchanged.sum(axis=1) == 1).all()
     for axis in (0, 1):  # the other coordinate is that of another keypoint
-        assert set(released.points[~kept[:, axis], axis]) <= set(secret.keypoints[:, axis])
+        assert set(released.points[~unchanged[:, axis], axis]) <= set(secret.keypoints[:, axis])
     normals = np.abs(released.lines[:, :2]).round(6)
-    np.testing.assert_array_equal(normals, kept)  # the normal points along the coordinate that is true
+    np.testing.assert_array_equal(normals, unchanged)  # the normal points along the coordinate that is true
     if count % 2 == 0:
         partners = [
             np.flatnonzero(secret.keypoints[:, axis] == value)
-            for axis, value in zip(kept.argmin(1), released.points[~kept], strict=True)
+            for axis, value in zip(unchanged.argmin(1), released.points[~unchanged], strict=True)
         ]
         assert all(partners[partner.item()].item() == row for row, partner in enumerate(partners))
 
@@ -92,7 +97,7 @@ class Identity(Permutation):
     """Exchanges nothing."""
 
     def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> Descriptors:
-        lines = draw_lines(secret.keypoints, rng.integers(0, 2, len(secret)) * (np.pi / 2))
+        lines = draw_lines(secret.keypoints, rng.choice([0.0, np.pi / 2], len(secret)))
         positions = Permuted(lines=lines.lines, points=secret.keypoints.copy())
         return Descriptors(positions=positions, size=secret.size, descriptors=secret.descriptors.copy())
 

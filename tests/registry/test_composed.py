@@ -1,6 +1,7 @@
 """Defenses composed from one of positions and one of descriptors."""
 
 import pickle
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -59,7 +60,7 @@ def test_a_record_lists_the_parts() -> None:
     assert not REQUIRED["defense"]({**recorded, "epsilon": 10.0})
 
 
-def test_the_release_has_the_lines_and_the_word_sets(tmp_path) -> None:
+def test_the_release_has_the_lines_and_the_word_sets(tmp_path: Path) -> None:
     ldp, public, secret = LDP(dictionary=write_dictionary(tmp_path)), Public(), draw_features()
     defense = Composed(geometry=RandomLines(), descriptors=ldp)
     check_defense(defense, public, secret)
@@ -74,7 +75,7 @@ def test_the_release_has_the_lines_and_the_word_sets(tmp_path) -> None:
     assert (defense.dictionary_field, defense.releases, defense.positions) == ("dictionary", WordSets, Lines)
 
 
-def test_lines_with_none_are_lines(tmp_path) -> None:
+def test_lines_with_none_are_lines() -> None:
     secret, public = draw_features(), Public()
     both = Composed(geometry=RandomLines(), descriptors=Undefended()).protect(secret, public, np.random.default_rng(1))
     assert are_equal(both, RandomLines().protect(secret, public, np.random.default_rng(1)))
