@@ -69,7 +69,10 @@ TEXT = {
 # (pattern of the path, pattern of the identifier or of the text around the word): why it stays.
 ALLOWED: dict[tuple[str, str], str] = {
     (r".*", r"unit_rows|unit_integer_points|unit_vertices|UNIT"): "vectors of unit norm",
-    (r"bench/(api|audit/|datasets/|images/|registry/).*|(leaderboard|metrics|tests|tools)/.*", r"unit"): "units of measure",
+    (
+        r"bench/(api|audit/|datasets/|images/|positions/|registry/).*|(leaderboard|metrics|tests|tools)/.*",
+        r"unit",
+    ): "units of measure",
     (r"bench/inversion/network\.py|tests/inversion/.*", r"paint|painted"): "names of tensors and metadata in shipped networks",
     (r"defenses/privunit\.py|tests/.*|docs/.*", r"PrivUnit"): "the name of a mechanism",
     (r"bench/rendering/.*", r"legs?|board"): "parts of people and furniture",
