@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from bench.api import Defense
 from bench.codebook.public import Public
-from bench.context.encoding import prior_odds
 from bench.positions import neighbour_model
 from bench.types import Descriptors, Floats, Indices, Release, WordSets
 
@@ -21,6 +20,8 @@ def predict_neighbours(release: Release, defense: Defense, public: Public, count
     if isinstance(release, Descriptors):
         log_ratios = model.log_ratios(release.descriptors[:, None])
     elif isinstance(release, WordSets):
+        from bench.context.encoding import prior_odds  # it imports PyTorch
+
         log_ratios = model.log_ratios(release.candidates, prior_odds(defense, public, release.subset_size))
     else:
         raise TypeError(f"expected Descriptors or WordSets, got {type(release).__name__}")
