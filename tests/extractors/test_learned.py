@@ -36,6 +36,8 @@ ALL: list[tuple[type[Extractor], dict[str, Any]]] = [
     (Disk, {}),
 ]
 EVERY = pytest.mark.parametrize(("plugin", "given"), ALL, ids=[" ".join([p.name(), *g.values()]) for p, g in ALL])
+# One photograph in `make test`, all three in `make test-exhaustive`.
+NUMBERS = pytest.mark.parametrize("number", [0, *(pytest.param(number, marks=pytest.mark.exhaustive) for number in (1, 2))])
 
 
 def build(plugin: type[Extractor], given: dict[str, Any]) -> Any:
@@ -78,7 +80,7 @@ def compare(found: Features, offset: Floats, keypoints: Floats, descriptors: Flo
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("width", "height"), [(256, 256), (300, 200)])
-@pytest.mark.parametrize("number", range(3))
+@NUMBERS
 def test_xfeat_is_the_authors_except_at_the_border(number: int, width: int, height: int) -> None:
     image = read(number, width, height)
     resized = np.array([width // 32 * 32, height // 32 * 32])
@@ -92,7 +94,7 @@ def test_xfeat_is_the_authors_except_at_the_border(number: int, width: int, heig
 
 @pytest.mark.slow
 @pytest.mark.parametrize("variant", ["t16", "n16", "n16rot", "n32"])
-@pytest.mark.parametrize("number", range(3))
+@NUMBERS
 def test_aliked_is_the_authors_at_strict_maxima(number: int, variant: str) -> None:
     image = read(number)
     keypoints, descriptors = detect_by_lightglue(image, "ALIKED", model_name=f"aliked-{variant}")
@@ -103,7 +105,7 @@ def test_aliked_is_the_authors_at_strict_maxima(number: int, variant: str) -> No
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", range(3))
+@NUMBERS
 def test_disk_is_lightglues(number: int) -> None:
     image = read(number)
     keypoints, descriptors = detect_by_lightglue(image, "DISK")
@@ -136,7 +138,7 @@ def measure_shift(plugin: type[Extractor], given: dict[str, Any], change: Callab
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("plugin", [XFeat, Disk])
+@pytest.mark.parametrize("plugin", [XFeat, pytest.param(Disk, marks=pytest.mark.exhaustive)])
 def test_pixels_of_the_mirrored_photograph(plugin: type[Extractor]) -> None:
     """Whole pixels: if the first centre was at (0, 0), keypoints of the mirrored photograph would be off by one."""
     assert measure_shift(plugin, {}, lambda image: image[:, ::-1], lambda xy: (256, 0) + xy * (-1, 1)) == pytest.approx(
@@ -146,7 +148,7 @@ def test_pixels_of_the_mirrored_photograph(plugin: type[Extractor]) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("variant", ["t16", "n16", "n32"])
+@pytest.mark.parametrize("variant", ["t16", *(pytest.param(name, marks=pytest.mark.exhaustive) for name in ("n16", "n32"))])
 def test_positions_in_the_enlarged_photograph(variant: str) -> None:
     """Twice the size doubles positions from the corner: if the first centre was at (0, 0), they would be off by a quarter."""
     shift = measure_shift(Aliked, {"variant": variant}, lambda image: cv2.resize(image, (512, 512)), lambda xy: xy / 2)
