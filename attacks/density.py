@@ -17,8 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from bench.api import PositionAttack, View
+from bench.positions.lines import read_lines
 from bench.positions.neighbourhood import find_densest
-from bench.types import Descriptors, Floats, Lines, Subspaces, WordSets
+from bench.types import Descriptors, Floats, Subspaces, WordSets
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,10 +31,7 @@ class Density(PositionAttack):
     width: float = 8.0  # standard deviation of the density's kernel in pixels
 
     def locate(self, view: View, rng: np.random.Generator) -> Floats:
-        positions = view.release.positions
-        if not isinstance(positions, Lines):
-            raise TypeError(f"density reads Lines, got {type(positions).__name__}")
-        return find_densest(positions.lines, view.release.size, self.width)
+        return find_densest(read_lines(view.release), view.release.size, self.width)
 
 
 PLUGIN = Density

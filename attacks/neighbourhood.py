@@ -26,10 +26,11 @@ import numpy as np
 from bench.api import Defense, Extractor, PositionAttack, View
 from bench.codebook.public import Public
 from bench.positions import neighbour_model
+from bench.positions.lines import read_lines
 from bench.positions.neighbourhood import recover_positions
 from bench.positions.prediction import predict_neighbours
 from bench.threat_model import PublicAssets
-from bench.types import Descriptors, Floats, Lines, WordSets
+from bench.types import Descriptors, Floats, WordSets
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,20 +44,15 @@ class Neighbourhood(PositionAttack):
     reach: float = 15.0  # pixels; a line farther away than this costs no more than one at this distance; tuned on tune.txt
 
     def explain_incompatible(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
-        trained = neighbour_model.load().meta["extractor"]
-        if extractor.name() != trained:
-            return f"the model of neighbours was trained for {trained}, not {extractor.name()}"
-        return None
+        return neighbour_model.load().explain_other_features(extractor)
 
     def assets(self, defense: Defense, extractor: Extractor, public: Public) -> Mapping[str, str]:
         return {"neighbour_model": neighbour_model.load().digest}
 
     def locate(self, view: View, rng: np.random.Generator) -> Floats:
         release = view.release
-        if not isinstance(release.positions, Lines):
-            raise TypeError(f"neighbourhood reads Lines, got {type(release.positions).__name__}")
         near, weights = predict_neighbours(release, view.defense, view.know(PublicAssets).assets, self.neighbours)
-        return recover_positions(release.positions.lines, near, weights, release.size, self.reach)
+        return recover_positions(read_lines(release), near, weights, release.size, self.reach)
 
 
 PLUGIN = Neighbourhood

@@ -17,9 +17,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from bench.api import PositionAttack, View
+from bench.positions.lines import read_lines
 from bench.positions.neighbourhood import recover_positions
 from bench.threat_model import TrueNeighbours
-from bench.types import Descriptors, Floats, Lines, Subspaces, WordSets
+from bench.types import Descriptors, Floats, Subspaces, WordSets
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,11 +33,8 @@ class NeighbourhoodOracle(PositionAttack):
     neighbours: int = 10
 
     def locate(self, view: View, rng: np.random.Generator) -> Floats:
-        positions = view.release.positions
-        if not isinstance(positions, Lines):
-            raise TypeError(f"neighbourhood-oracle reads Lines, got {type(positions).__name__}")
         near = view.know(TrueNeighbours).order[:, : self.neighbours]
-        return recover_positions(positions.lines, near, np.ones(near.shape, np.float32), view.release.size)
+        return recover_positions(read_lines(view.release), near, np.ones(near.shape, np.float32), view.release.size)
 
 
 PLUGIN = NeighbourhoodOracle

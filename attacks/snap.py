@@ -26,10 +26,11 @@ from bench.codebook.public import Public
 from bench.core.errors import SampleError
 from bench.localization import map_matching
 from bench.positions import neighbour_model
+from bench.positions.lines import read_lines
 from bench.positions.neighbourhood import recover_positions
 from bench.positions.prediction import predict_neighbours
 from bench.threat_model import PublicAssets, ServerMap
-from bench.types import Descriptors, Floats, Lines, WordSets
+from bench.types import Descriptors, Floats, WordSets
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,18 +46,13 @@ class Snap(PositionAttack):
     trials: int = 30_000  # maximum number of RANSAC's trials
 
     def explain_incompatible(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
-        trained = neighbour_model.load().meta["extractor"]
-        if extractor.name() != trained:
-            return f"the model of neighbours was trained for {trained}, not {extractor.name()}"
-        return None
+        return neighbour_model.load().explain_other_features(extractor)
 
     def assets(self, defense: Defense, extractor: Extractor, public: Public) -> Mapping[str, str]:
         return {"neighbour_model": neighbour_model.load().digest}
 
     def locate(self, view: View, rng: np.random.Generator) -> Floats:
         release, server = view.release, view.know(ServerMap).server
-        if not isinstance(release.positions, Lines):
-            raise TypeError(f"snap reads Lines, got {type(release.positions).__name__}")
         matcher = map_matching.select_matcher(view.defense)
         if matcher is None:
             raise SampleError(f"no matcher supports {type(release).__name__}")
@@ -70,7 +66,7 @@ class Snap(PositionAttack):
         verified = ~np.isnan(known[:, 0])
         view.notes.append(f"{verified.sum()} keypoints verified")
         near, weights = predict_neighbours(release, view.defense, view.know(PublicAssets).assets, self.neighbours)
-        positions = recover_positions(release.positions.lines, near, weights, release.size, self.reach, known)
+        positions = recover_positions(read_lines(release), near, weights, release.size, self.reach, known)
         return np.where(verified[:, None], known, positions).astype(np.float32)
 
 

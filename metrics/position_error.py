@@ -8,6 +8,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from bench.api import Metric
+from bench.positions.accuracy import measure_errors
 from bench.types import Floats
 
 
@@ -22,7 +23,7 @@ class PositionError(Metric):
 
     def __call__(self, truth: Floats, estimate: Floats) -> float:
         # (N, 2) each
-        return float(np.median(np.linalg.norm(truth.astype(np.float64) - estimate, axis=1)))
+        return float(np.median(measure_errors(truth, estimate)))
 
 
 PLUGIN = PositionError

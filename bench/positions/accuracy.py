@@ -5,9 +5,16 @@ from __future__ import annotations
 from typing import ClassVar, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bench.api import Metric
 from bench.types import Floats
+
+
+def measure_errors(truth: Floats, estimate: Floats) -> NDArray[np.float64]:
+    """Return the distance of each recovered position to the true one. (N, 2) twice -> (N,) pixels"""
+    errors: NDArray[np.float64] = np.linalg.norm(truth.astype(np.float64) - estimate, axis=1)
+    return errors
 
 
 class PositionAUC(Metric):
@@ -24,5 +31,4 @@ class PositionAUC(Metric):
 
     def __call__(self, truth: Floats, estimate: Floats) -> float:
         # (N, 2) each
-        errors = np.linalg.norm(truth.astype(np.float64) - estimate, axis=1)
-        return float(np.maximum(0, 1 - errors / self.reach).mean())
+        return float(np.maximum(0, 1 - measure_errors(truth, estimate) / self.reach).mean())

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from bench.api import Extractor
 from bench.codebook.public import ASSETS
 from bench.core.errors import UserError
 from bench.formats import tensor_file
@@ -34,6 +35,13 @@ class NeighbourModel:
     arrays: tensor_file.Arrays
     meta: dict[str, Any]
     digest: str
+
+    def explain_other_features(self, extractor: Extractor) -> str | None:
+        """Return the reason why the model does not suit the features of `extractor`; None if it was trained for them."""
+        trained = self.meta["extractor"]
+        if extractor.name() != trained:
+            return f"the model of neighbours was trained for {trained}, not {extractor.name()}"
+        return None
 
     @cached_property
     def weights(self) -> dict[str, Floats]:
