@@ -211,13 +211,17 @@ def test_a_killed_process_stops_the_run_and_the_next_run_resumes(images: Path, t
 
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    """Two worker processes that have the fake plugins."""
+    """Two worker processes that have the fake plugins. Their nannies start new ones, however often these are killed."""
     distributed = pytest.importorskip("distributed", reason="needs dask.distributed: pip install distributed")
-    with pytest.MonkeyPatch.context() as patch:
-        install_plugins(tmp_path_factory.mktemp("workers"), patch, FAKES)
-        local_cluster = distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50)
-    with local_cluster:
-        yield local_cluster
+    import dask
+
+    with dask.config.set({"distributed.deploy.lost-worker-timeout": "1 day"}):
+        # LocalCluster closes a nanny whose worker is lost both now and so long after an earlier loss (15 s by default).
+        with pytest.MonkeyPatch.context() as patch:
+            install_plugins(tmp_path_factory.mktemp("workers"), patch, FAKES)
+            local_cluster = distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50)
+        with local_cluster:
+            yield local_cluster
 
 
 @pytest.mark.exhaustive
