@@ -15,7 +15,7 @@ Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 Indices = NDArray[np.int64]
 # Rows of integers, of which only the directions count: 8 bits as in SIFT, or 16 bits with sign.
-Words = NDArray[np.uint8] | NDArray[np.int16]
+Words = NDArray[np.uint8] | NDArray[np.int8]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

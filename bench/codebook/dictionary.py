@@ -1,8 +1,8 @@
 """Dictionaries of descriptors: K of LDP-Feat, W of affine lifting, and Z of the attacker.
 
 Words are vectors of integers, of which only the directions count. For SIFT they have 8 bits, like its descriptors. For other
-descriptors they have 16 bits with a sign, and a norm of about `SIGNED_NORM`. So dot products of words are integers below 2^24,
-which float32 represents exactly: comparisons of words are the same on every machine, as the defenses require.
+descriptors they have 8 bits with a sign, and a norm of about `SIGNED_NORM`. So dot products of words are integers below 2^24, which
+float32 represents exactly: comparisons of words are the same on every machine, as the defenses require.
 
 Rows are in random order, fixed when the dictionary is built. Affine lifting splits them into n sub-databases of equal length
 (to within one): sub-database s holds rows floor(s K / n) up to floor((s + 1) K / n).
@@ -27,7 +27,7 @@ from bench.types import Bytes, Features, Floats, Words
 KIND = "dictionary"
 SIFT = 128  # length of 8-bit words
 NORM = 512.0  # of SIFT's 8-bit vectors
-SIGNED_NORM = 2048.0  # of signed words; rounding turns them by about a thousandth of a radian
+SIGNED_NORM = 127.0  # of signed words; rounding turns them by about 0.02 radian, a word is about 0.5 radian from its descriptors
 MAX_NEGATIVE = 0.01  # greatest fraction of the squared norm in negative components of descriptors with 8-bit words: noise
 EXACT = 2**24  # squared norms below this give exact dot products in float32
 
@@ -97,14 +97,14 @@ class Dictionary:
 
 def encode(features: Features) -> Words:
     """Return descriptors as words: the 8-bit vectors if there are any, else signed ones. (N, D)"""
-    return round_rows(features.descriptors, np.dtype(np.int16)) if features.codes is None else features.codes
+    return round_rows(features.descriptors, np.dtype(np.int8)) if features.codes is None else features.codes
 
 
 def round_rows(rows: Floats, dtype: np.dtype[Any]) -> Words:
-    """Return unit rows as words of type `dtype`, uint8 or int16. (N, D) float32 -> (N, D)"""
+    """Return unit rows as words of type `dtype`, uint8 or int8. (N, D) float32 -> (N, D)"""
     if dtype == np.uint8:
         return np.clip(np.rint(rows * NORM), 0, 255).astype(np.uint8)
-    return np.rint(unit_rows(rows) * SIGNED_NORM).astype(np.int16)
+    return np.rint(unit_rows(rows) * SIGNED_NORM).astype(np.int8)
 
 
 def save(path: Path, words: Words, meta: dict[str, Any]) -> Dictionary:
@@ -118,19 +118,19 @@ def load(path: Path) -> Dictionary:
     Raises
     ------
     UserError
-        if the file is damaged, its words are not (K, 128) uint8 or (K, D) int16, one is zero or too long, or its metadata name no
+        if the file is damaged, its words are not (K, 128) uint8 or (K, D) int8, one is zero or too long, or its metadata name no
         photographs.
     """
     arrays, meta, digest = tensor_file.load(path, KIND)
     words = arrays.get("words", np.empty(0))
-    if words.dtype not in (np.uint8, np.int16):
-        raise UserError(f"{path}: words are {words.dtype}, expected uint8 or int16")
+    if words.dtype not in (np.uint8, np.int8):
+        raise UserError(f"{path}: words are {words.dtype}, expected uint8 or int8")
     length = SIFT if words.dtype == np.uint8 else "D"
     if words.ndim != 2 or len(words) < 2 or words.shape[1] == 0 or length not in ("D", words.shape[1]):
         raise UserError(f"{path}: words have shape {words.shape}, expected (K, {length}) with K at least 2")
     if not words.any(axis=1).all():
         raise UserError(f"{path}: word {int(np.argmin(words.any(axis=1)))} is zero, which has no direction")
-    if words.dtype == np.int16 and (longest := int(np.square(words, dtype=np.int64).sum(axis=1).max())) >= EXACT:
+    if words.dtype == np.int8 and (longest := int(np.square(words, dtype=np.int64).sum(axis=1).max())) >= EXACT:
         raise UserError(f"{path}: a word has norm {longest**0.5:.0f}, expected about {SIGNED_NORM:.0f}; build the file anew")
     photographs = meta.get("photographs")
     if not isinstance(photographs, list) or not all(isinstance(content, str) for content in photographs):
