@@ -38,28 +38,32 @@ class Keypoints(ImageAttack):
     weights: Asset = Asset("shipped")
 
     def explain_incompatible(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
-        network = self._network()
-        if network.meta["encoding"] != "positions":
+        networks = self._list_networks()
+        if any(network.meta["encoding"] != "positions" for network in networks):
             return "that network reads descriptors; train one with `bench train --encoding positions`"
-        return explain_other_features(network.meta, extractor, public)
+        reasons = [explain_other_features(network.meta, extractor, public) for network in networks]
+        return None if None in reasons else reasons[-1]
 
     def assets(self, defense: Defense, extractor: Extractor, public: Public) -> Mapping[str, str]:
-        return {"weights": self._network().verify()}
+        return {"weights": self._network(extractor, public).verify()}
 
     def reconstruct(self, view: View, rng: np.random.Generator) -> Floats:
         from bench.inversion.reconstruct import reconstruct_image
 
-        return reconstruct_image(
-            self._network().module, view.release, POSITION_SYMMETRIES, np.empty(0, np.float32), 0, "positions"
-        )
+        module = self._network(view.extractor, view.know(PublicAssets).assets).module
+        return reconstruct_image(module, view.release, POSITION_SYMMETRIES, np.empty(0, np.float32), 0, "positions")
 
-    def _network(self) -> Network:
+    def _network(self, extractor: Extractor, public: Public) -> Network:
+        """Return the network for an extractor that `explain_incompatible` accepts."""
+        return next(net for net in self._list_networks() if explain_other_features(net.meta, extractor, public) is None)
+
+    def _list_networks(self) -> list[Network]:
+        """Load the given network, or the shipped ones, that of SIFT last."""
         if self.weights != "shipped":
-            return load(Path(self.weights))
-        path = ASSETS / "positions.safetensors"
-        if not path.is_file():
+            return [load(Path(self.weights))]
+        if not (paths := sorted(ASSETS.glob("positions*.safetensors"))):
             raise UserError("keypoints: the network is not installed; reinstall, or pass keypoints:weights=FILE")
-        return load(path)
+        return [load(path) for path in paths]
 
 
 PLUGIN = Keypoints

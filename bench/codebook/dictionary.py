@@ -1,7 +1,7 @@
 """Dictionaries of descriptors: K of LDP-Feat, W of affine lifting, and Z of the attacker.
 
-Words are vectors of integers, of which only the directions count. For SIFT they have 8 bits, like its descriptors. For other
-descriptors they have 8 bits with a sign, and a norm of about `SIGNED_NORM`. So dot products of words are integers below 2^24, which
+Words are vectors of 8-bit integers, of which only the directions count. For SIFT they are unsigned, like its descriptors. For
+other descriptors they have a sign, and a norm of about `SIGNED_NORM`. So dot products of words are integers below 2^24, which
 float32 represents exactly: comparisons of words are the same on every machine, as the defenses require.
 
 Rows are in random order, fixed when the dictionary is built. Affine lifting splits them into n sub-databases of equal length

@@ -19,7 +19,12 @@ if TYPE_CHECKING:
 ASSETS = Path(__file__).parents[1] / "assets"
 
 # The files of the shipped assets. The attacker's database is built from other photographs.
-SHIPPED = {"shipped": "dictionary.safetensors", "shipped-public": "public-database.safetensors"}
+SHIPPED = {
+    "shipped": "dictionary.safetensors",
+    "shipped-public": "public-database.safetensors",
+    "shipped-xfeat": "dictionary-xfeat.safetensors",
+    "shipped-aliked": "dictionary-aliked.safetensors",
+}
 REFERENCES = "references"
 CLUSTERED = {"shipped-clustered": "shipped"}  # dictionaries that are clustered from the words of another one
 

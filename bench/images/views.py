@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
+import hashlib
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -18,6 +21,7 @@ from bench.types import Bytes, Features
 
 SIDES = (256, 320)  # pixels
 MIRRORED = (False, True)
+LIMIT = "max_keypoints"  # field of an extractor: the greatest number of keypoints, those of highest score
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +54,23 @@ def _extract_view(pixels: Bytes, mirrored: bool, photograph: str, source: Source
         mirror = np.ascontiguousarray(pixels[:, ::-1])
         return PhotographView(photograph, mirror, extractor.extract(mirror, None))
     return PhotographView(photograph, pixels, extractor.extract(pixels, source))
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomLimit(Extractor):
+    """Extracts a number of keypoints that depends on the image: log-uniform within `limits`, those of highest score.
+
+    Views of a training then have as few or as many keypoints as the limits of the extractors that its network is to serve.
+    """
+
+    extractor: Extractor  # with a field `max_keypoints`
+    limits: tuple[int, int]
+
+    def extract(self, image: np.ndarray, source: Source | None = None) -> Features:
+        rng = np.random.default_rng(list(hashlib.sha256(image.tobytes()).digest()))
+        count = round(math.exp(rng.uniform(*np.log(self.limits))))
+        limited: Extractor = dataclasses.replace(self.extractor, **{LIMIT: count})  # type: ignore[type-var]
+        return limited.extract(image, source)
 
 
 class LazyViews(Sequence[PhotographView]):

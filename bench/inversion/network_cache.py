@@ -33,6 +33,7 @@ def build_key(plan: Plan) -> dict[str, Any]:
         "crossfit": [public.digest(asset) for asset in plan.crossfit],
         "start": None if plan.initial_checkpoint is None else weights.load(plan.initial_checkpoint).digest,
         "encoding": plan.encoding,
+        "keypoints": plan.keypoints,
         "widths": list(plan.widths),
         "training": dataclasses.asdict(plan.training),
         "source": provenance.hash_modules(

@@ -9,6 +9,7 @@ from pathlib import Path
 from bench.api import Extractor
 from bench.core.errors import UserError
 from bench.images.photographs import Source
+from bench.images.views import LIMIT, RandomLimit
 from bench.inversion.data import Target
 from bench.inversion.encoding import Encoding
 from bench.inversion.network import COARSENET, Shape
@@ -45,6 +46,20 @@ class Plan:
     encoding: Encoding = "invariant"  # input of the network
     widths: tuple[int, ...] = Shape.widths  # of the network's levels
     training: Training = Training()  # frozen
+    keypoints: tuple[int, int] | None = None  # limits of each view's `max_keypoints`, drawn at random; None: the extractor's
+
+    def __post_init__(self) -> None:
+        if self.keypoints is None:
+            return
+        if len(self.keypoints) != 2 or not 1 <= self.keypoints[0] <= self.keypoints[1]:
+            raise UserError(f"--keypoints: expected LOW,HIGH with 1 ≤ LOW ≤ HIGH, got {','.join(map(str, self.keypoints))}")
+        if not hasattr(self.extractor, LIMIT):
+            raise UserError(f"--keypoints: {self.extractor.name()} has no {LIMIT}")
+
+    @property
+    def training_extractor(self) -> Extractor:
+        """The extractor of the training's views."""
+        return self.extractor if self.keypoints is None else RandomLimit(extractor=self.extractor, limits=self.keypoints)
 
 
 @dataclass(frozen=True, kw_only=True)

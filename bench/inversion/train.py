@@ -84,8 +84,9 @@ def train_worker(group: ProcessGroup, plan: Plan, out: Path, log: Path | None) -
     if shared:
         raise UserError(f"{len(shared)} photographs are in both the training and the validation set; remove them from one set")
     few = len(plan.photographs) <= MAX_IN_MEMORY
-    views = collect_views(list(plan.photographs), extractor) if few else LazyViews(plan.photographs, extractor)
-    unseen = collect_views(list(plan.validation), extractor)[::4]  # unmirrored, at 256 pixels
+    source = plan.training_extractor
+    views = collect_views(list(plan.photographs), source) if few else LazyViews(plan.photographs, source)
+    unseen = collect_views(list(plan.validation), source)[::4]  # unmirrored, at 256 pixels
     examples, held_out, errors = _build_examples(plan, views, unseen)
     symmetries = POSITION_SYMMETRIES if encoding == "positions" else find_symmetries(extractor)
     examples = dataclasses.replace(examples, symmetries=symmetries)
@@ -96,7 +97,7 @@ def train_worker(group: ProcessGroup, plan: Plan, out: Path, log: Path | None) -
     shape = Shape(inputs=sample.values.shape[1], candidates=candidates, length=length, widths=plan.widths)
     initial = None if plan.initial_checkpoint is None else weights.load(plan.initial_checkpoint)
     meta = {
-        **weights.describe(targets, extractor, Public()),
+        **weights.describe(targets, extractor, Public(), plan.keypoints),
         "encoding": encoding,
         "slots": slots,
         "start": initial and initial.digest,

@@ -16,6 +16,7 @@ from bench.codebook.public import Public
 from bench.core.errors import UserError
 from bench.formats import tensor_file
 from bench.formats.network_file import NetworkFile, build_module
+from bench.images.views import LIMIT
 from bench.inversion.encoding import Encoding
 from bench.registry import fields, spec
 from bench.settings import Between, OneOf
@@ -115,6 +116,9 @@ def _are_metadata(meta: dict[str, Any]) -> bool:
     others = meta.get("others", [])
     if not isinstance(others, list) or not all(isinstance(other, dict) for other in others):
         return False
+    limits = meta.get("keypoints", [1, 1])
+    if not (isinstance(limits, list) and len(limits) == 2 and all(type(limit) is int for limit in limits)):
+        return False
     targets = [meta, *others]
     plugins = (meta["extractor"], *(target.get("defense") for target in targets))
     if not all(isinstance(plugin, dict) and isinstance(plugin.get("name"), str) for plugin in plugins):
@@ -179,11 +183,17 @@ def list_training_stages(meta: dict[str, Any]) -> list[dict[str, Any]]:
     return [*meta.get("earlier", []), {key: meta.get(key) for key in STAGE_METADATA}]
 
 
-def describe(targets: Sequence[Target], extractor: Extractor, public: Public) -> dict[str, Any]:
-    """Return the metadata that describe the releases of a training. Those of the first target are not nested."""
+def describe(
+    targets: Sequence[Target], extractor: Extractor, public: Public, keypoints: tuple[int, int] | None = None
+) -> dict[str, Any]:
+    """Return the metadata that describe the releases of a training. Those of the first target are not nested.
+
+    `keypoints` are the limits of a random `max_keypoints`.
+    """
     first, *others = (_describe_target(target, public) for target in targets)
     nested = {"others": others} if others else {}
-    return {**first, **nested, "extractor": spec.to_json_with_digests(extractor, public)}
+    limits = {} if keypoints is None else {"keypoints": list(keypoints)}
+    return {**first, **nested, **limits, "extractor": spec.to_json_with_digests(extractor, public)}
 
 
 def _describe_target(target: Target, public: Public) -> dict[str, Any]:
@@ -238,8 +248,12 @@ def explain_other_features(meta: dict[str, Any], extractor: Extractor, public: P
     if meta["extractor"]["name"] != extractor.name():  # their fields have little in common
         return f"trained for features of {meta['extractor']['name']}, not {extractor.name()}"
     features = spec.to_json_with_digests(extractor, public)
+    limits = meta.get("keypoints")
     for field in sorted(meta["extractor"].keys() | features.keys()):
-        if meta["extractor"].get(field) != features.get(field):
+        if field == LIMIT and limits is not None:
+            if not limits[0] <= features[field] <= limits[1]:
+                return f"trained for features with {field} from {limits[0]} to {limits[1]}, not {features[field]}"
+        elif meta["extractor"].get(field) != features.get(field):
             expected, actual = meta["extractor"].get(field), features.get(field)
             return f"trained for features with {field} {expected}, not {actual}"
     return None

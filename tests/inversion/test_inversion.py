@@ -453,6 +453,34 @@ def test_a_network_is_incompatible_with_other_releases(sources, words, tmp_path)
     assert "dictionary sha256" in (weights.explain_incompatible(meta, LDP(dictionary=Asset(copied)), Sift(), public) or "")
 
 
+@pytest.mark.slow
+def test_one_network_for_several_numbers_of_keypoints(sources, tmp_path):
+    plan = build_plan(sources, keypoints=(50, 200), training=TINY)
+    counts = [len(view.features) for view in collect_views(list(plan.photographs), plan.training_extractor)]
+    assert min(counts) >= 50
+    assert max(counts) <= 200
+    assert len(set(counts)) == len(counts) == 8  # each view has its own
+    alone = collect_views(list(plan.photographs), Sift(max_keypoints=counts[0]))[0].features  # those of highest score
+    first = collect_views(list(plan.photographs), plan.training_extractor)[0].features
+    assert np.array_equal(alone.keypoints, first.keypoints)
+    meta = train(plan, tmp_path / "W.safetensors")
+    for extractor, reason in [
+        (Sift(max_keypoints=50), None),
+        (Sift(max_keypoints=200), None),
+        (Sift(), "trained for features with max_keypoints from 50 to 200, not 1000"),
+        (Sift(max_keypoints=100, upright=False), "trained for features with upright True, not False"),
+    ]:
+        assert weights.explain_incompatible(meta, Undefended(), extractor, Public()) == reason
+
+
+@pytest.mark.parametrize(
+    ("limits", "message"), [((5,), "expected LOW,HIGH"), ((9, 3), "1 ≤ LOW ≤ HIGH, got 9,3"), ((0, 3), "expected LOW,HIGH")]
+)
+def test_wrong_numbers_of_keypoints_are_refused(limits, message, sources):
+    with pytest.raises(UserError, match=message):
+        build_plan(sources, keypoints=limits)
+
+
 def test_one_network_for_several_defenses(sources, words, tmp_path):
     """Words and descriptors, with settings of their own. Control: the network reads which defense it is."""
     plateau = {"epsilon": Between(8.0, 16.0), "subset_size": OneOf((1, 3))}

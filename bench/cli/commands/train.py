@@ -56,6 +56,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="initial weights: those of a network for the same kind of releases, or for raw descriptors",
     )
+    parser.add_argument(
+        "--keypoints",
+        type=parse_wholes,
+        metavar="LOW,HIGH",
+        help="train for every max_keypoints of the extractor within these limits (default: its own alone)",
+    )
     parser.add_argument("--rate", type=float, metavar="R", help="peak learning rate")
     parser.add_argument("--steps", type=parse_whole, metavar="N", help="training steps")
     parser.add_argument("--batch", type=parse_whole, metavar="N", help="training samples per step")
@@ -91,6 +97,7 @@ def execute(args: argparse.Namespace) -> int:
         encoding=args.encoding,
         widths=args.widths or profile.widths,
         training=dataclasses.replace(profile.training, **overrides),
+        keypoints=args.keypoints,
     )
     key = network_cache.build_key(plan)
     meta = network_cache.fetch(key, args.out)
