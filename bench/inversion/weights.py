@@ -144,7 +144,8 @@ def initialise_from(fresh: Inverter, trained: Inverter, candidates: int) -> None
 
     From a network for raw descriptors, the first layer treats the first `candidates` slots as descriptors. These are the words of
     a set, or the point of a subspace nearest to zero. Weights are divided by √candidates, which preserves the size of a sum of
-    independent slots. The other slots and the settings get weight zero. All other layers are copied.
+    independent slots. The other slots and the settings get weight zero. All other layers are copied. If the raw descriptors have
+    another length, they are other features: the first layer remains as it is.
 
     Raises
     ------
@@ -162,12 +163,14 @@ def _copy_weights(fresh: Inverter, trained: Inverter, candidates: int) -> None:
     old, new = trained.state_dict(), fresh.state_dict()
     if any(old[name].shape != value.shape for name, value in new.items() if name != first):
         raise UserError("--initial-checkpoint: that network has other sizes; pass a network with equal --widths")
-    for name, value in new.items():
-        if value.shape == old[name].shape:
-            value.copy_(old[name])
-    if new[first].shape == old[first].shape:
-        return
+    for name in new.keys() - {first}:
+        new[name].copy_(old[name])
     length = old[first].shape[1] - 2  # columns of the descriptor; the last two are the position within the cell
+    if trained.shape.length == length != fresh.shape.length and not trained.shape.candidates:
+        return
+    if new[first].shape == old[first].shape:
+        new[first].copy_(old[first])
+        return
     slots = (new[first].shape[1] - 2) // max(1, length)
     if trained.shape.candidates or not length or slots < candidates:
         raise UserError(

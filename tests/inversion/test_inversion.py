@@ -331,6 +331,16 @@ def test_a_network_initialised_from_one_for_the_same_releases_is_equal(shape):
         weights.initialise_from(other, trained, 1)
 
 
+@pytest.mark.parametrize("sizes", [{"inputs": 66}, {"inputs": 130}, {"inputs": 4 * 64 + 3, "candidates": 4}], ids=str)
+def test_a_network_initialised_from_one_for_other_features_has_a_new_first_layer(sizes):
+    trained, module = Inverter(Shape(inputs=130, length=128)), Inverter(Shape(**sizes, length=64))
+    before = module.embed[0].weight.clone()
+    weights.initialise_from(module, trained, 1)
+    assert torch.equal(module.embed[0].weight, before)
+    copied = {name: value for name, value in module.state_dict().items() if name != "embed.0.weight"}
+    assert all(torch.equal(value, trained.state_dict()[name]) for name, value in copied.items())
+
+
 @pytest.mark.slow
 def test_training_learns(sources, tmp_path):
     """Forty steps on two photographs reduce the loss well below that of the first step."""

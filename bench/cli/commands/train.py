@@ -54,7 +54,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--initial-checkpoint",
         type=Path,
         metavar="FILE",
-        help="initial weights: those of a network for the same kind of releases, or for raw descriptors",
+        help="initial weights: those of a network for the same kind of releases, or for raw descriptors, also of other features",
     )
     parser.add_argument(
         "--keypoints",
