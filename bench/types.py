@@ -6,7 +6,7 @@ Shapes use N for keypoints, D for the length of a descriptor, m for candidates p
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +53,8 @@ class Features:
 class Positions:
     """Released positions of keypoints. Base class, with one subclass for each kind of release."""
 
+    disclosed: ClassVar[str]  # what the release discloses in the clear; no ε covers it
+
     def __len__(self) -> int:
         """Return the number of keypoints."""
         raise NotImplementedError
@@ -65,6 +67,8 @@ class Positions:
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Points(Positions):
     """Positions in the clear."""
+
+    disclosed = "the keypoints' positions"
 
     keypoints: Floats  # (N, 2) x, y in pixels
 
@@ -79,6 +83,8 @@ class Points(Positions):
 class Lines(Positions):
     """One line per keypoint, which passes through it."""
 
+    disclosed = "a line through each keypoint"
+
     lines: Floats  # (N, 3) a, b, c of {(x, y): a x + b y + c = 0} in pixels, a² + b² = 1
 
     def __len__(self) -> int:
@@ -91,6 +97,8 @@ class Lines(Positions):
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Permuted(Lines):
     """Points with one coordinate of their keypoint and one of another keypoint. The line has all points of the former."""
+
+    disclosed = "the keypoints' coordinates, one of them with the coordinate of another keypoint"
 
     points: Floats  # (N, 2) x, y in pixels
 

@@ -1,10 +1,11 @@
 """The signal of an experiment: whether an attack beats the two baselines, without which its score is no evidence.
 
-The baselines are `blank`, the best constant image, and `keypoints`, the positions alone. For each of the metrics `METRICS`,
-samples are paired and their mean difference to each baseline is tested by Student's t against "at most zero". A metric has the
-greatest p-value of its baselines, since all of them have to be exceeded (an intersection-union test). The metrics are a family of
-two tests with Holm's correction. The experiment has a signal if a corrected p-value is less than `SIGNIFICANCE`. This is
-equivalent to a corrected lower bound of the mean difference above zero against each baseline.
+The baselines are `blank`, the best constant image, and `keypoints`, the positions alone. A release that hides positions has only
+the first. For each of the metrics `METRICS`, samples are paired and their mean difference to each baseline is tested by Student's
+t against "at most zero". A metric has the greatest p-value of its baselines, since all of them have to be exceeded (an
+intersection-union test). The metrics are a family of two tests with Holm's correction. The experiment has a signal if a corrected
+p-value is less than `SIGNIFICANCE`. This is equivalent to a corrected lower bound of the mean difference above zero against each
+baseline.
 
 Identification has a third baseline, `chance`. Equal similarities have their mean rank, so a constant image has the logarithm of
 the mean rank. That is 7.0 bits below the first rank. A random order is 6.6 bits below on average, so it would beat the constant
@@ -20,21 +21,21 @@ from enum import Enum
 
 import numpy as np
 
-from bench.mechanisms.composition import UNCOVERED
 from bench.runner.records import Record
+from bench.types import Points
 from leaderboard.chance import IDENTIFIED, LOG_RECIPROCAL_RANK
 from leaderboard.intervals import LEVEL, MIN_SAMPLES, Estimate, Interval, correct_holm, estimate_mean
 
-BASELINES = ("blank", "keypoints")  # names of attacks
-ORACLES = ("oracle",)  # names of attacks with knowledge that no attacker has
+BASELINES = ("blank", "keypoints")  # names of attacks; the second is none where positions are hidden
+ORACLES = ("oracle", "neighbourhood-oracle")  # names of attacks with knowledge that no attacker has
 SIGNIFICANCE = (1 - LEVEL) / 2  # one-sided: that of the lower end of a two-sided interval
 # The values that are compared, by metric. The logarithm of the reciprocal rank is the information about the photograph, in bits.
 METRICS: Mapping[str, Callable[[float], float]] = {"ssim": float, IDENTIFIED: math.log2}
 CHANCE = "chance"
 REMARK = (
-    "Signal: the attack beats the best constant image (blank) and the positions alone (keypoints), in SSIM or in the logarithm "
-    f"of {IDENTIFIED}. Test: differences paired by sample, Student's t, one-sided {SIGNIFICANCE:.1%}, Holm's correction over the "
-    "two metrics. The score of an attack without a signal is no evidence of privacy."
+    "Signal: the attack beats the best constant image (blank) and, unless they are hidden, the positions alone (keypoints), in "
+    f"SSIM or in the logarithm of {IDENTIFIED}. Test: differences paired by sample, Student's t, one-sided {SIGNIFICANCE:.1%}, "
+    "Holm's correction over the two metrics. The score of an attack without a signal is no evidence of privacy."
 )
 
 SampleValues = Mapping[str, Mapping[str, float]]  # metric -> sample -> value
@@ -93,24 +94,28 @@ class Signal:
         return {Verdict.SIGNAL: "yes", Verdict.ABSENT: "no"}.get(self.verdict, self.verdict.value)
 
 
-def judge_signal(attack: SampleValues, baselines: Sequence[tuple[str, SampleValues]]) -> Signal:
+def judge_signal(
+    attack: SampleValues, baselines: Sequence[tuple[str, SampleValues]], required: Sequence[str] = BASELINES
+) -> Signal:
     """Return the signal of an attack.
 
     Parameters
     ----------
     attack : the values of the attack
-    baselines : (name, values) of the baselines; each name of `BASELINES` at least once. All of them have to be exceeded.
+    baselines : (name, values) of the baselines, all of which have to be exceeded
+    required : names that must be among them
 
     A metric is tested on the samples for which the attack and all baselines have a value. There must be at least `MIN_SAMPLES`.
     """
-    missing = [name for name in BASELINES if name not in {baseline for baseline, _ in baselines}]
+    missing = [name for name in required if name not in {baseline for baseline, _ in baselines}]
     if missing:
         return Signal(verdict=Verdict.UNTESTED, reason=f"no {' and no '.join(missing)} records")
     shared = {metric: _list_shared(metric, attack, [values for _, values in baselines]) for metric in METRICS}
     tested = {metric: samples for metric, samples in shared.items() if len(samples) >= MIN_SAMPLES}
     if not tested:
         count = max(map(len, shared.values()))
-        return Signal(verdict=Verdict.UNTESTED, reason=f"{count} samples with both baselines; at least {MIN_SAMPLES} are needed")
+        reason = f"{count} samples with {' and '.join(required)}; at least {MIN_SAMPLES} are needed"
+        return Signal(verdict=Verdict.UNTESTED, reason=reason)
     differences = {
         metric: [
             *((name, _estimate_difference(metric, samples, attack, values)) for name, values in baselines),
@@ -188,8 +193,10 @@ def _judge(number: int, experiments: Sequence[ExperimentRecords], values: Sequen
         return Signal(verdict=Verdict.BASELINE)
     if is_oracle(own[0]):
         return Signal(verdict=Verdict.REFERENCE)
-    baselines = [(name, values[index]) for name in BASELINES for index in _find_baselines(name, own, experiments)]
-    return judge_signal(values[number], baselines)
+    hidden = bool(own[0]["privacy"].get("uncovered")) and not _has_clear_positions(own)
+    required = ("blank",) if hidden else BASELINES
+    baselines = [(name, values[index]) for name in required for index in _find_baselines(name, own, experiments)]
+    return judge_signal(values[number], baselines, required)
 
 
 def _find_baselines(name: str, own: ExperimentRecords, experiments: Sequence[ExperimentRecords]) -> list[int]:
@@ -205,13 +212,18 @@ def _find_baselines(name: str, own: ExperimentRecords, experiments: Sequence[Exp
 
 def _has_equal_positions(one: ExperimentRecords, other: ExperimentRecords) -> bool:
     """Return whether the releases of two experiments have the same positions of keypoints, in the clear."""
-    if not all(UNCOVERED[0] in records[0]["privacy"].get("uncovered", ()) for records in (one, other)):
+    if not (_has_clear_positions(one) and _has_clear_positions(other)):
         return False
     counts, others = (
         {record["sample"]: record["privacy"].get("keypoints") for record in records if record["status"] == "ok"}
         for records in (one, other)
     )
     return all(others.get(sample) == count for sample, count in counts.items())
+
+
+def _has_clear_positions(records: ExperimentRecords) -> bool:
+    """Return whether the records state that the positions of keypoints are in the clear."""
+    return Points.disclosed in records[0]["privacy"].get("uncovered", ())
 
 
 def _list_shared(metric: str, attack: SampleValues, baselines: Sequence[SampleValues]) -> list[str]:

@@ -277,7 +277,7 @@ def build_privacy(experiment: Experiment, keypoints: int | None) -> dict[str, An
         "releases": releases,  # number of releases of the photograph
         **image,
         "delta": composition.DELTA,  # of the optimal composition
-        "uncovered": [*composition.UNCOVERED, *([composition.LINKS] if memoized else [])],
+        "uncovered": [experiment.defense.positions.disclosed, composition.COUNT, *([composition.LINKS] if memoized else [])],
         "log10_true": experiment.privacy.log10_true,
         "seeded": True,
         "private": False,  # a seeded release is for measurements

@@ -19,6 +19,7 @@ from bench.codebook.public import ASSETS
 from bench.core.table import to_csv, to_latex, to_markdown
 from bench.formats import tensor_file
 from bench.inversion import weights
+from bench.types import Lines
 from leaderboard import chance, comparison, site, tables
 from leaderboard.group_tables import build_pairs_table, build_ranking_table
 from leaderboard.intervals import MIN_SAMPLES
@@ -136,7 +137,7 @@ def test_without_both_baselines_nothing_is_tested(rng: np.random.Generator) -> N
         assert [f"--attack {name}" in advice for name in BASELINES] == [name in missing for name in BASELINES]
     few = {"ssim": dict(list(values["ssim"].items())[: MIN_SAMPLES - 1])}
     assert judge_signal(few, [(name, low) for name in BASELINES]).text == (
-        f"not tested: {MIN_SAMPLES - 1} samples with both baselines; at least {MIN_SAMPLES} are needed"
+        f"not tested: {MIN_SAMPLES - 1} samples with blank and keypoints; at least {MIN_SAMPLES} are needed"
     )
     assert explain_untested([judge_signal(values, [(name, low) for name in BASELINES]), None]) is None
 
@@ -164,6 +165,22 @@ def test_baselines_of_another_defense_serve_where_the_positions_are_equal() -> N
     # A defense's own baselines come first.
     own = [*given, *reconstructions(ldp(8.0), [0.7] * 7, attack={"name": "keypoints"})]
     assert judge(own)[0] == TEXT
+
+
+def test_hidden_positions_have_no_baseline_of_positions() -> None:
+    """`blank` of another defense serves, and a `keypoints` of clear positions is not compared, however strong."""
+
+    def hide(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
+        hidden = {"uncovered": [Lines.disclosed, *fabricated.UNCOVERED[1:]]}
+        return [one | {"privacy": one["privacy"] | hidden} for one in records]
+
+    lines, guess = {"name": "lines"}, {"name": "neighbourhood"}
+    blank, clear = baselines(NONE, 7, 0.4)[:7], reconstructions(NONE, [0.9] * 7, attack={"name": "keypoints"})
+    for scores, expected in ((HIGH, "signal"), (LOW, TEXT)):
+        records = reconstructions(lines, scores, attack=guess)
+        assert judge([*hide(records), *blank, *clear])[0] == expected
+        assert judge([*hide(records), *clear])[0] == "not tested: no blank records"
+        assert judge([*records, *blank])[0] == "not tested: no keypoints records"  # the control: positions in the clear
 
 
 def test_a_weaker_copy_of_a_baseline_does_not_help() -> None:
