@@ -14,6 +14,7 @@ from bench.api import Dataset, Extractor
 from bench.core import threads
 from bench.core.errors import UserError, unknown_name
 from bench.extractors.sift import Sift
+from bench.images.photographs import name_images
 from bench.runner import engines
 from bench.runner.engines import Engine
 from bench.settings import Asset
@@ -115,7 +116,7 @@ def takes_dataset(name: str) -> bool:
 def _name_folder(images: Path | None, evaluation_set: EvaluationSet) -> str:
     if evaluation_set.dataset is not None:
         return evaluation_set.dataset.name()
-    return "builtin" if images is None else images.resolve().name
+    return "builtin" if images is None else name_images(images)
 
 
 def _reproduce_figures(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from bench.cli.terminal import DONE, FAILED, add_extractor, add_seed, parse_whole, print_rich, print_status
+from bench.cli.terminal import DONE, FAILED, add_extractor, add_images, add_seed, parse_whole, print_rich, print_status
 
 SUMMARY = "reproduce a table of the paper, or its figures, beside the published values"
 EPILOG = """Each table shows intervals over the photographs, and a verdict on each claim of the paper.
@@ -27,7 +27,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         default="cpu",
         help="smoke, cpu, dense or paper: the size of the experiment (default: %(default)s)",
     )
-    parser.add_argument("--images", type=Path, metavar="DIR", help="a folder of photographs (default: the built-in ones)")
+    add_images(parser, "the built-in ones")
     parser.add_argument("--dataset", metavar="SPEC", help="the scene, for tables about localization (default: a gallery)")
     parser.add_argument(
         "--workers", type=parse_whole, metavar="N", help="worker processes, for tables about localization (default: one per core)"
