@@ -30,7 +30,7 @@ def read(text: str) -> list[Source]:
     return list_photographs(Path(text))
 
 
-def write_places(root: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+def write_places365(root: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     """Write the layout of Places365's validation set, with the checksums of our own lists."""
     write_album(root / "val_large", 3)
     names = sorted(path.name for path in (root / "val_large").iterdir())
@@ -78,7 +78,7 @@ def write_folders(root: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     return f"torchvision:ImageFolder,root={root}"
 
 
-LAYOUTS = {"Places365": write_places, "Caltech101": write_caltech, "Flickr30k": write_flickr, "LFWPeople": write_people}
+LAYOUTS = {"Places365": write_places365, "Caltech101": write_caltech, "Flickr30k": write_flickr, "LFWPeople": write_people}
 LAYOUTS["ImageFolder"] = write_folders
 COUNTS = {"Places365": 3, "Caltech101": 4, "Flickr30k": 3, "LFWPeople": 3, "ImageFolder": 4}
 
@@ -181,7 +181,7 @@ def test_later_item_that_is_no_image_is_a_failed_sample(monkeypatch: pytest.Monk
 def test_missing_files_are_left_out_with_a_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    text = write_places(tmp_path, monkeypatch)
+    text = write_places365(tmp_path, monkeypatch)
     first = read(text)[0]
     first.path.unlink()
     assert len(read(text)) == 2
@@ -211,7 +211,7 @@ def test_missing_torchvision_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_run_names_the_dataset_and_not_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import pandas as pd
 
-    text, results = write_places(tmp_path / "places", monkeypatch), {}
+    text, results = write_places365(tmp_path / "places", monkeypatch), {}
     for name, images in (("dataset", text), ("folder", str(tmp_path / "places"))):
         command = ["run", "--defense", "none", "--attack", "blank", "--images", images, "--out", str(tmp_path / name)]
         assert cli.main(command) == 0
