@@ -9,6 +9,7 @@ from bench.cli.terminal import DONE, FAILED, add_extractor, add_images, add_seed
 
 SUMMARY = "reproduce a table of the paper, or its figures, beside the published values"
 EPILOG = """Each table shows intervals over the photographs, and a verdict on each claim of the paper.
+With --profile paper, it first names the data of the paper that are replaced by our own, and the commands that download them.
 
 examples:
   bench reproduce table1
@@ -57,6 +58,10 @@ def execute(args: argparse.Namespace) -> int:
     from leaderboard import reproduce
 
     materials = {name: getattr(args, name) for name in reproduce.list_materials() if getattr(args, name)}
+    if args.profile == "paper":
+        given = {*materials, *(name for name in ("images", "dataset") if getattr(args, name) is not None)}
+        for line in reproduce.list_missing(args.what, given):
+            print_status(DONE, f"not the paper's: {line}")
     done = reproduce.reproduce(
         args.what,
         args.profile,
