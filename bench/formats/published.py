@@ -54,7 +54,7 @@ PLACES365 = "http://data.csail.mit.edu/places/places365/"
 PLACES365_LICENCE = "non-commercial research and education, by the terms of the page"
 PLACES365_PAGE = "http://places2.csail.mit.edu/download.html"
 PLACES365_LISTS = File(
-    url=PLACES365 + "filelist_places365-standard.tar", gigabytes=0.1, checksum="md5:35a0585fee1fa656440f3ab298f8479c"
+    url=PLACES365 + "filelist_places365-standard.tar", gigabytes=None, checksum="md5:35a0585fee1fa656440f3ab298f8479c"
 )
 
 DATASETS: Mapping[str, Published] = {
@@ -147,14 +147,15 @@ def find(name: str) -> Published:
     return DATASETS[name]
 
 
-def describe(name: str) -> str:
-    """Return licence, files and use of a dataset, as lines of text."""
+def describe(name: str, folder: Path | None = None) -> str:
+    """Return licence, files, and use in a folder, of a dataset, as lines of text."""
     dataset = find(name)
     lines = [dataset.title, f"licence: {dataset.licence}", f"terms: {dataset.page}"]
     for file in dataset.files:
         size = "size unknown" if file.gigabytes is None else f"about {file.gigabytes:g} GB" if file.gigabytes else "small"
         lines.append(f"file: {file.url} ({size}; {file.checksum or 'no published checksum'})")
-    return "\n".join([*lines, f"use: {dataset.usage}"])
+    usage = dataset.usage if folder is None else dataset.usage.replace("DIR", str(folder))
+    return "\n".join([*lines, f"use: {usage}"])
 
 
 def fetch(name: str, folder: Path, checksums: Mapping[str, str], unverified: bool = False) -> Iterator[str]:
@@ -184,14 +185,13 @@ def fetch(name: str, folder: Path, checksums: Mapping[str, str], unverified: boo
             f"{name}: no checksum is published for {', '.join(lacking)}; give --checksum FILE=sha256:..., or accept unverified "
             "files with --unverified"
         )
-    fetched = _read_record(name, folder)
+    _read_record(name, folder)  # creates a new folder
     with _lock(folder):
-        yield from _fetch_files(name, folder, checksums, fetched)
+        yield from _fetch_files(name, folder, checksums)
 
 
-def _fetch_files(
-    name: str, folder: Path, checksums: Mapping[str, str], fetched: dict[str, dict[str, str | None]]
-) -> Iterator[str]:
+def _fetch_files(name: str, folder: Path, checksums: Mapping[str, str]) -> Iterator[str]:
+    fetched = _read_record(name, folder)
     for file in find(name).files:
         if file.url in fetched:
             yield f"{file.name}: fetched before"

@@ -4,6 +4,7 @@ import dataclasses
 import hashlib
 import io
 import json
+import shutil
 import tarfile
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
@@ -309,18 +310,6 @@ def test_damaged_archives_are_named(name: str, damage: str, tmp_path: Path) -> N
         archives.unpack(tmp_path / name, tmp_path / "to")
 
 
-def test_interrupted_unpacking_is_repeated(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = tmp_path / "to"
-    with monkeypatch.context() as patch:
-        patch.setattr(archives.shutil, "copyfileobj", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
-        with pytest.raises(KeyboardInterrupt):
-            fetch("hpatches", folder)
-    server.requests.clear()
-    assert fetch("hpatches", folder)[0].startswith("hpatches-sequences-release.zip: 22 files")
-    assert not server.requests
-    assert len(list_photographs(folder)) == 12
-
-
 # ---- the command
 
 
@@ -344,6 +333,7 @@ def test_command_shows_the_licence_first(server: Server, tmp_path: Path, capsys:
     assert run("places365-val", "--to", tmp_path / "to") == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[1].startswith("licence: non-commercial")
+    assert f"use: --images torchvision:Places365,root={tmp_path / 'to'},split=val" in lines
     assert lines[-1].startswith("val_large.tar: 2 files, verified by md5")
 
 
@@ -358,6 +348,32 @@ def test_command_resumes(server: Server, tmp_path: Path, capsys: pytest.CaptureF
     served.end = None
     assert run(*command) == 0
     assert server.requests[-1][1] == "bytes=1000-"
+
+
+@pytest.mark.parametrize("fault", [OSError(28, "No space left on device"), KeyboardInterrupt()])
+def test_command_continues_after_a_fault_without_a_download(
+    fault: BaseException, server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ("hpatches", "--to", tmp_path / "to", "--unverified")
+    with monkeypatch.context() as patch:
+        patch.setattr(archives.shutil, "copyfileobj", lambda *_: (_ for _ in ()).throw(fault))
+        assert run(*command) == (1 if isinstance(fault, OSError) else 130)
+    message = capsys.readouterr().err.splitlines()[-1]
+    assert str(fault.args[1] if fault.args else "interrupted") in message
+    assert "run the same command again" in message
+    server.requests.clear()
+    assert run(*command) == 0
+    assert not server.requests
+
+
+def test_full_disk_is_found_before_unpacking(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "x.zip").write_bytes(pack_zip({"a": bytes(3_000_000)}))
+    (folder := tmp_path / "to").mkdir()
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=2_000_000))
+    with pytest.raises(OSError, match="3 MB are needed, 2 MB are free"):
+        archives.unpack(tmp_path / "x.zip", folder)
+    assert not list(folder.iterdir())
 
 
 @pytest.mark.parametrize(

@@ -71,7 +71,7 @@ def _fetch(args: argparse.Namespace) -> int:
         rows = [(name, each.title, each.licence) for name, each in published.DATASETS.items()]
         print_rich(build_table(("name", "dataset", "licence"), rows, text=("name", "dataset", "licence")))
         return DONE
-    print(published.describe(args.name), flush=True)
+    print(published.describe(args.name, args.to), flush=True)
     if args.to is None:
         return print_status(DONE, f"nothing was downloaded; to accept the licence and download: --to DIR with {args.name}")
     pairs = [text.partition("=") for text in args.checksum]
