@@ -1,6 +1,8 @@
 """torchvision's datasets as photographs, in the layouts of the downloads, and the error for each mistake."""
 
 import hashlib
+import json
+import pickle
 import shutil
 from pathlib import Path
 from typing import Any
@@ -78,9 +80,17 @@ def write_folders(root: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     return f"torchvision:ImageFolder,root={root}"
 
 
+def write_coco(root: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    pytest.importorskip("pycocotools", reason="pycocotools is not installed, which torchvision's CocoDetection needs")
+    write_album(root, 3)
+    images = [{"id": number, "file_name": f"{number}.png", "width": 80, "height": 64} for number in (2, 0, 1)]
+    (root / "instances.json").write_text(json.dumps({"images": images, "annotations": [], "categories": []}))
+    return f"torchvision:CocoDetection,root={root},annFile={root / 'instances.json'}"
+
+
 LAYOUTS = {"Places365": write_places365, "Caltech101": write_caltech, "Flickr30k": write_flickr, "LFWPeople": write_people}
-LAYOUTS["ImageFolder"] = write_folders
-COUNTS = {"Places365": 3, "Caltech101": 4, "Flickr30k": 3, "LFWPeople": 3, "ImageFolder": 4}
+LAYOUTS |= {"ImageFolder": write_folders, "CocoDetection": write_coco}
+COUNTS = {"Places365": 3, "Caltech101": 4, "Flickr30k": 3, "LFWPeople": 3, "ImageFolder": 4, "CocoDetection": 3}
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
@@ -115,6 +125,19 @@ def test_images_without_files_are_read_by_index() -> None:
     assert len(set(hashes)) == 12
     assert hashes == [source.content_hash() for source in read("torchvision:FakeData,size=12")]
     assert hashes[0] != read("torchvision:FakeData,size=12,random_offset=1")[0].content_hash()
+
+
+def test_images_of_cifar_are_read_by_index(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "cifar-10-batches-py"
+    folder.mkdir()
+    pixels = np.random.default_rng(0).integers(0, 256, (3, 32, 32, 3), dtype=np.uint8)
+    batch = {"data": pixels.transpose(0, 3, 1, 2).reshape(3, -1), "labels": [0, 1, 0]}
+    (folder / "test_batch").write_bytes(pickle.dumps(batch))
+    (folder / "batches.meta").write_bytes(pickle.dumps({"label_names": ["airplane", "automobile"]}))
+    monkeypatch.setattr(datasets.cifar, "check_integrity", lambda *_: True)  # of the archive
+    found = read(f"torchvision:CIFAR10,root={tmp_path},train=false")
+    assert [source.name for source in found] == ["0", "1", "2"]
+    assert np.array_equal([np.asarray(photographs.decode(source)[0]) for source in found], pixels)
 
 
 def test_each_class_states_its_arguments() -> None:
