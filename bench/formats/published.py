@@ -193,10 +193,13 @@ def fetch(name: str, folder: Path, checksums: Mapping[str, str], unverified: boo
 def _fetch_files(name: str, folder: Path, checksums: Mapping[str, str]) -> Iterator[str]:
     fetched = _read_record(name, folder)
     for file in find(name).files:
-        if file.url in fetched:
-            yield f"{file.name}: fetched before"
-            continue
         checksum = checksums.get(file.name) or file.checksum
+        if file.url in fetched:
+            earlier = fetched[file.url]
+            if (checksum or "").startswith("sha256:") and checksum != earlier["digest"]:
+                raise UserError(f"--to {folder}: holds {file.name} of {earlier['digest']}, not {checksum}; give a new folder")
+            yield f"{file.name}: fetched before, {_format_state(earlier['verified'])}"
+            continue
         path = folder / file.folder / file.name
         path.parent.mkdir(exist_ok=True)
         digest = download(file.url, path, checksum)
@@ -205,8 +208,11 @@ def _fetch_files(name: str, folder: Path, checksums: Mapping[str, str]) -> Itera
         _write_record(name, folder, fetched)
         if archives.is_archive(file.name):
             path.unlink()
-        state = "NOT VERIFIED" if checksum is None else f"verified by {checksum.partition(':')[0]}"
-        yield f"{file.name}: {count} files, {state}, {digest}"
+        yield f"{file.name}: {count} files, {_format_state(checksum)}, {digest}"
+
+
+def _format_state(checksum: str | None) -> str:
+    return "NOT VERIFIED" if checksum is None else f"verified by {checksum.partition(':')[0]}"
 
 
 @contextmanager

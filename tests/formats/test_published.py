@@ -154,7 +154,9 @@ def test_fetched_datasets_are_unpacked_and_recorded(name: str, server: Server, t
         assert (folder / file.folder / file.name).exists() == (not archives.is_archive(file.name))
     before = read_files(folder)
     server.requests.clear()
-    assert all(line.endswith("fetched before") for line in fetch(name, folder))
+    again = fetch(name, folder)
+    assert all("fetched before" in line for line in again)
+    assert ["NOT VERIFIED" in line for line in again] == ["NOT VERIFIED" in line for line in lines]
     assert (read_files(folder), server.requests) == (before, [])
 
 
@@ -220,6 +222,14 @@ def test_wrong_checksum_unpacks_nothing(unverified: bool, server: Server, tmp_pa
         fetch("hpatches", folder, unverified, **{"hpatches-sequences-release.zip": f"sha256:{'0' * 64}"})
     assert set(read_files(folder)) == {published.RECORD, f".{published.RECORD}.lock"}
     assert fetch("hpatches", folder)
+
+
+def test_checksum_of_an_earlier_download_is_compared(server: Server, tmp_path: Path) -> None:
+    folder, checksums = tmp_path / "to", list_checksums(server, "hpatches")
+    fetch("hpatches", folder)
+    assert fetch("hpatches", folder, **checksums)
+    with pytest.raises(UserError, match=r"holds hpatches-sequences-release\.zip of sha256:.*, not sha256:0+; give a new folder"):
+        fetch("hpatches", folder, **dict.fromkeys(checksums, f"sha256:{'0' * 64}"))
 
 
 @pytest.mark.parametrize(
