@@ -75,6 +75,7 @@ ALLOWED: dict[tuple[str, str], str] = {
     ): "units of measure",
     (r"bench/inversion/network\.py|tests/inversion/.*", r"paint|painted"): "names of tensors and metadata in shipped networks",
     (r"defenses/privunit\.py|tests/.*|docs/.*", r"PrivUnit"): "the name of a mechanism",
+    (r"bench/formats/published\.py|tests/.*", r"(?i:places365)"): "the name of a dataset",
     (r"bench/rendering/.*", r"legs?|board"): "parts of people and furniture",
     (r"(bench/inversion|bench/rendering|tests|tools)/.*", r"cells?|CELL"): "grid cells",
     (r"bench/core/table\.py|tests/.*", r"cells?"): "cells of a table",

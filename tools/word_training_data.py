@@ -97,7 +97,7 @@ def collect_training_views(sources: Sequence[Source], sides: Sequence[int] = SID
     with Progress("features", len(sources)) as progress:
         for source in sources:
             try:
-                image, _ = decode(source.path)
+                image, _ = decode(source)
                 for side in sides:
                     pixels = crop_square(image, side)
                     extractor = Sift(max_keypoints=int(MOST_KEYPOINTS * (side / SIDE) ** 2))

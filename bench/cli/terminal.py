@@ -6,6 +6,7 @@ import argparse
 import re
 import sys
 from collections.abc import Iterable
+from pathlib import Path
 
 from bench.core.errors import UserError
 
@@ -74,6 +75,12 @@ def add_seed(parser: argparse.ArgumentParser, purpose: str = "all random numbers
 def add_extractor(parser: argparse.ArgumentParser, default: str | None = "sift", shown: str = "sift") -> None:
     """Declare --extractor; `shown` is the default in the help text."""
     parser.add_argument("--extractor", metavar="SPEC", default=default, help=f"extractor of the features (default: {shown})")
+
+
+def add_images(parser: argparse.ArgumentParser, default: str | None = None) -> None:
+    """Declare --images; `default` describes what is read without it."""
+    text = "a folder of photographs, or torchvision:NAME,root=DIR,... (docs/formats.md)"
+    parser.add_argument("--images", type=Path, metavar="DIR", help=text if default is None else f"{text} (default: {default})")
 
 
 def add_engine(parser: argparse.ArgumentParser) -> None:

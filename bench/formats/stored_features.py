@@ -9,7 +9,6 @@ below ours as given: no link is resolved, and no part of the path is left out.
 from __future__ import annotations
 
 import numpy as np
-from PIL import Image
 
 from bench.core.errors import SampleError
 from bench.formats import lists
@@ -61,7 +60,7 @@ def read_upright_size(source: Source, size: tuple[int, int] | None = None) -> tu
         if the photograph has another size, or an EXIF rotation, which features of other programs ignore.
     """
     try:
-        with Image.open(source.path) as opened:
+        with source.open() as opened:
             found = opened.size
             orientation = read_orientation(opened)
     except MemoryError:

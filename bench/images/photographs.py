@@ -22,6 +22,7 @@ import numpy as np
 from PIL import ExifTags, Image
 
 from bench.core.errors import SampleError, UserError
+from bench.images import torchvision_datasets
 from bench.types import Bytes
 
 SIDE = 256  # pixels
@@ -60,6 +61,32 @@ class Source:
     def content_hash(self) -> str:
         return "sha256:" + hashlib.sha256(self.path.read_bytes()).hexdigest()
 
+    def open(self) -> Image.Image:
+        """Return the image, whose pixels may not be loaded yet."""
+        return Image.open(self.path)
+
+    def file(self) -> Source | None:
+        """Return the photograph itself, or None if it has no file of its own."""
+        return self
+
+
+@dataclass(frozen=True)
+class DatasetImage(Source):
+    """An image of a torchvision dataset that is in no file of its own. `path` is its name, for messages."""
+
+    dataset: str  # as --images names it
+    index: int
+
+    def content_hash(self) -> str:
+        image = self.open()
+        return "sha256:" + hashlib.sha256(f"{image.mode} {image.size} ".encode() + image.tobytes()).hexdigest()
+
+    def open(self) -> Image.Image:
+        return torchvision_datasets.read_image(self.dataset, self.index)
+
+    def file(self) -> Source | None:
+        return None
+
 
 @dataclass(frozen=True, eq=False)
 class Photograph:
@@ -72,6 +99,8 @@ class Photograph:
 def list_photographs(directory: Path) -> list[Source]:
     """Return the JPEG, PNG, TIFF, BMP, PPM, WebP and AVIF files of a folder and its subfolders, sorted by path.
 
+    A text such as `torchvision:Places365,root=DIR,split=val` in place of a folder names a dataset of torchvision.
+
     A linked file or folder counts as part of the folder that holds the link. One logged line names the photographs that are left
     out: files of other formats, resource forks of macOS, broken links, and folders that cannot be read.
 
@@ -83,6 +112,8 @@ def list_photographs(directory: Path) -> list[Source]:
     UserError
         if there is no such folder, or no photograph in it.
     """
+    if torchvision_datasets.is_dataset(directory):
+        return _list_dataset(str(directory))
     if not directory.is_dir():
         raise UserError(f"--images {directory}: no such folder")
     files, left_out = _find_files(directory)
@@ -92,6 +123,25 @@ def list_photographs(directory: Path) -> list[Source]:
     if not files:
         raise UserError(f"--images {directory}: no photograph in it (looked for {', '.join(sorted(SUFFIXES))})")
     return [Source(path.relative_to(directory).as_posix(), path) for path in files]
+
+
+def name_images(images: Path) -> str:
+    """Return the name of a folder, or of a dataset of torchvision."""
+    return torchvision_datasets.format_name(str(images)) if torchvision_datasets.is_dataset(images) else images.resolve().name
+
+
+def _list_dataset(text: str) -> list[Source]:
+    """Return the images of a dataset of torchvision. Files are sorted by path. One logged line counts those that are missing."""
+    images = torchvision_datasets.list_images(text)
+    files = sorted((name, path) for name, path in images if path is not None)
+    if not files:
+        return [DatasetImage(name, Path(name), text, index) for index, (name, _) in enumerate(images)]
+    sources = [Source(name, path) for name, path in files if path.is_file()]
+    if not sources:
+        raise UserError(f"--images {text}: none of its {len(files)} files exists, such as {files[0][1]}")
+    if missing := len(files) - len(sources):
+        _log_once(f"--images {text}: left out: {missing} of {len(files)} files do not exist")
+    return sources
 
 
 @cache
@@ -154,15 +204,15 @@ def _describe(left_out: Mapping[str, list[Path]], directory: Path) -> str:
 def split_validation(sources: list[Source], selection: Path | None) -> tuple[list[Source], list[Source]]:
     """Return photographs split into a training set and a validation set.
 
-    `selection` is a folder of other photographs for validation, or a text file with the names of the validation photographs, one
-    per line. For None, every twentieth photograph is for validation.
+    `selection` is a folder or a torchvision dataset of other photographs for validation, or a text file with the names of the
+    validation photographs, one per line. For None, every twentieth photograph is for validation.
 
     Raises
     ------
     UserError
         if `selection` does not exist, or contains the name of no photograph.
     """
-    if selection is not None and selection.is_dir():
+    if selection is not None and (selection.is_dir() or torchvision_datasets.is_dataset(selection)):
         return sources, list_photographs(selection)
     if selection is None:
         names = {source.name for source in sources[::20]}
@@ -219,7 +269,7 @@ def _find_in_package(package: str, directory: str, *names: str) -> list[Source]:
     return [Source(path.stem, path) for path in (Path(spec.origin).parent / directory / name for name in names)]
 
 
-def read(path: Path) -> Photograph:
+def read(photograph: Path | Source) -> Photograph:
     """Read one photograph by the rule of this module.
 
     Raises
@@ -227,11 +277,11 @@ def read(path: Path) -> Photograph:
     SampleError
         if the file cannot be decoded, or is smaller than 32 pixels on a side.
     """
-    image, notes = decode(path)
+    image, notes = decode(photograph)
     return Photograph(crop_square(image, SIDE), notes)
 
 
-def decode(path: Path, upright: bool = True, whole: bool = False) -> tuple[Image.Image, tuple[str, ...]]:
+def decode(photograph: Path | Source, upright: bool = True, whole: bool = False) -> tuple[Image.Image, tuple[str, ...]]:
     """Return an 8-bit RGB image, and notes on its conversion.
 
     It has the size of the file, except for JPEG files of more than `MAX_WHOLE` pixels. Their decoder averages 2 x 2 pixels.
@@ -246,23 +296,25 @@ def decode(path: Path, upright: bool = True, whole: bool = False) -> tuple[Image
     SampleError
         if the file cannot be decoded, is smaller than 32 pixels on a side, or its values have no defined range.
     """
+    source = photograph if isinstance(photograph, Source) else Source(photograph.name, photograph)
+    name = source.path.name
     try:
-        with Image.open(path) as opened:
+        with source.open() as opened:
             notes = _list_remarks(opened)
             orientation = read_orientation(opened)
             if not whole and opened.width * opened.height > MAX_WHOLE:
                 notes += _halve(opened)
             opened.load()
             image = _rotate(opened, orientation, upright)
-        image, more = _convert(image, path.name)
+        image, more = _convert(image, name)
     except Image.DecompressionBombError as error:
-        raise SampleError(f"{path.name}: too many pixels to read safely ({error})") from error
+        raise SampleError(f"{name}: too many pixels to read safely ({error})") from error
     except (SampleError, MemoryError):
         raise
     except Exception as error:
         # Pillow's readers raise errors of any class for damaged files: OSError, SyntaxError, KeyError, struct.error, ...
-        raise SampleError(f"{path.name}: cannot be read as an image: {error}") from error
-    return image, tuple(f"{path.name}: {note}" for note in (*notes, *more))
+        raise SampleError(f"{name}: cannot be read as an image: {error}") from error
+    return image, tuple(f"{name}: {note}" for note in (*notes, *more))
 
 
 def read_orientation(image: Image.Image) -> int:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bench.core.errors import UserError
+from bench.core.errors import SampleError, UserError
 from bench.core.hashing import digest
 from bench.images import photographs
 from bench.images.photographs import Source
@@ -48,7 +48,7 @@ class Collection:
 
 
 def collect_photographs(images: Images) -> Collection:
-    """Return one sample for each photograph of a folder or a list; None stands for the built-in photographs.
+    """Return one sample for each photograph of a folder, of a torchvision dataset or of a list; None: the built-in photographs.
 
     Raises
     ------
@@ -113,7 +113,7 @@ def read_pixels(image: ImageSource) -> tuple[Bytes, tuple[str, ...]]:
         if the image cannot be read.
     """
     if isinstance(image, Source):
-        photograph = photographs.read(image.path)
+        photograph = photographs.read(image)
         return photograph.pixels, photograph.notes
     return image.read(), ()
 
@@ -128,13 +128,15 @@ def _content_hash(image: ImageSource) -> str:
         return image.content_hash()
     except OSError as error:
         return f"unreadable: {error.strerror}"  # its record will be `failed`
+    except SampleError as error:
+        return f"unreadable: {error}"
 
 
 def _list_sources(images: Images) -> tuple[str, list[Source]]:
     if images is None:
         return "builtin", photographs.list_builtin()
     if isinstance(images, (str, Path)):
-        return Path(images).resolve().name, photographs.list_photographs(Path(images))
+        return photographs.name_images(Path(images)), photographs.list_photographs(Path(images))
     sources = [image if isinstance(image, Source) else Source(Path(image).name, Path(image)) for image in images]
     if len({source.name for source in sources}) < len(sources):
         raise UserError("two of the photographs have the same file name; rename one of them")

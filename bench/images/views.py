@@ -41,7 +41,7 @@ def extract_views(source: Source, extractor: Extractor) -> Iterator[PhotographVi
     SampleError
         if the photograph cannot be read or has no keypoint.
     """
-    image, _ = decode(source.path)
+    image, _ = decode(source)
     photograph = source.content_hash()
     for side in SIDES:
         pixels = crop_square(image, side)
@@ -109,7 +109,7 @@ class LazyViews(Sequence[PhotographView]):
             subset._keys, subset._hash = self._keys[index], self._hash
             return subset
         source, side, mirrored = self._keys[index]
-        image, _ = decode(source.path)
+        image, _ = decode(source)
         return _extract_view(crop_square(image, side), mirrored, self._hash(source), source, self._extractor)
 
     def __iter__(self) -> Iterator[PhotographView]:

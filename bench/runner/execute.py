@@ -39,7 +39,7 @@ def run(
     Parameters
     ----------
     defenses, attacks : plugins, such as `[LDP(epsilon=10)]` and `[DIA()]`
-    images : a folder, files or sources; None for the built-in photographs
+    images : a folder, a dataset of torchvision, files or sources; None for the built-in photographs
     extractor : `Sift()` if None
     task : `Reconstruction()` if None
     dataset : the scene, for a task that needs one

@@ -57,6 +57,8 @@ def open_whole(sample: Sample) -> Sample:
     (source,) = sample.images
     if not isinstance(source, Source):
         return sample
+    if source.file() is None:
+        raise SampleError(f"{source.name}: it is in no file of its own; export without --full-images")
     return replace(sample, images=(File(path=source.path, size=read_upright_size(source), name=source.name),))
 
 
@@ -87,7 +89,7 @@ def collect_features(trial: Trial, attack: Attack | None) -> ImageFeatures:
     if isinstance(image, Source):
         size = read_upright_size(image)
         keypoints = map_out_of_square(keypoints.astype(np.float64), size, release.size[0]).astype(np.float32)
-    file = image if isinstance(image, Source) else image.file()
+    file = image.file()
     path = None if file is None else file.path
     return ImageFeatures(name=trial.sample.name, path=path, size=size, keypoints=keypoints, descriptors=rows)
 
@@ -168,7 +170,7 @@ def _find_root(images: Sequence[ImageFeatures]) -> Path:
     """Return the folder that contains all images."""
     paths = [image.path.absolute() for image in images if image.path is not None]
     if len(paths) < len(images):
-        raise UserError("COLMAP needs images in files, and this dataset is rendered; write it by `bench dataset` first")
+        raise UserError("COLMAP needs images in files of their own; write a rendered dataset by `bench dataset` first")
     roots = {Path(str(path).removesuffix(image.name)) for path, image in zip(paths, images, strict=True)}
     if len(roots) != 1 or any(not path.as_posix().endswith(image.name) for path, image in zip(paths, images, strict=True)):
         raise UserError("COLMAP needs all images in one folder; give --images")

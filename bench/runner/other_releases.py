@@ -93,6 +93,6 @@ def random_window(source: Source, rng: np.random.Generator) -> Bytes:
 
 @functools.lru_cache(maxsize=128)
 def _shrunk(source: Source) -> Any:
-    image, _ = decode(source.path)
+    image, _ = decode(source)
     scale = min(1.0, LARGEST / min(image.size))
     return image.resize((round(image.width * scale), round(image.height * scale)), Image.Resampling.BICUBIC)

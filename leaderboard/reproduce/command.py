@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,12 +14,13 @@ from bench.api import Dataset, Extractor
 from bench.core import threads
 from bench.core.errors import UserError, unknown_name
 from bench.extractors.sift import Sift
+from bench.images.photographs import name_images
 from bench.runner import engines
 from bench.runner.engines import Engine
 from bench.settings import Asset
 from leaderboard import localization_results
 from leaderboard.provenance import format_provenance
-from leaderboard.reproduce import figures, page, run, tables
+from leaderboard.reproduce import figures, page, paper_data, run, tables
 from leaderboard.reproduce.drawing import Drawing, FigureData, save
 from leaderboard.reproduce.profiles import Materials, Setting, find_profile
 from leaderboard.reproduce.run import EvaluationSet
@@ -106,6 +107,15 @@ def group_drawings() -> dict[str, tuple[Drawing, ...]]:
     return {FIGURES: tuple(drawing for drawing in drawings if not drawing.uses_queries), **of_queries}
 
 
+def list_missing(name: str, given: Collection[str]) -> tuple[str, ...]:
+    """Return a line on each part of the paper's data that the table or figures `name` replace by our own.
+
+    `given` are the names of the user's inputs. An unknown name has no lines: `reproduce` raises its error.
+    """
+    known = name in {**tables.load_tables(), **group_drawings()}
+    return tuple(paper_data.list_missing(name, given, takes_dataset(name))) if known else ()
+
+
 def takes_dataset(name: str) -> bool:
     """Return whether the table or figure uses a dataset instead of photographs."""
     table = tables.load_tables().get(name)
@@ -115,7 +125,7 @@ def takes_dataset(name: str) -> bool:
 def _name_folder(images: Path | None, evaluation_set: EvaluationSet) -> str:
     if evaluation_set.dataset is not None:
         return evaluation_set.dataset.name()
-    return "builtin" if images is None else images.resolve().name
+    return "builtin" if images is None else name_images(images)
 
 
 def _reproduce_figures(

@@ -84,7 +84,7 @@ def select_photographs(images: Path | None, profile: Profile, limit: int) -> Eva
     if images is None:
         sources = [source for source in photographs.list_builtin() if profile.builtin is None or source.name in profile.builtin]
         return _build_evaluation_set("built-in photographs", sources, limit)
-    return _build_evaluation_set(f"photographs of {images.resolve().name}", photographs.list_photographs(images), limit)
+    return _build_evaluation_set(f"photographs of {photographs.name_images(images)}", photographs.list_photographs(images), limit)
 
 
 def _build_evaluation_set(name: str, sources: Sequence[Source], limit: int) -> EvaluationSet:

@@ -44,6 +44,9 @@ LONG = {
 UNTESTED = {
     "reproduce figure-inlier": "minutes; test_reproduce.py runs it in the profile smoke",
     "reproduce tableS2": "minutes; test_reproduce.py runs it in the profile smoke",
+    "dataset fetch places365-val --to": "2 GB; test_published.py downloads small archives",
+    "dataset fetch hpatches --to": "1.3 GB; test_published.py downloads small archives",
+    "run --defense none --attack dia --images torchvision:Places365": "its photographs are not distributed",
     "run --task localization --dataset captured:path=fox/": "its photographs are not distributed",
     "run --defense none --defense affine --defense ldp:epsilon=16": "the release of networks: 100 photographs",
     "run --defense none --attack dia --extractor sift:upright=false": "the release of networks: 100 photographs",

@@ -293,7 +293,7 @@ def test_a_dataset_is_exported_with_its_model(tmp_path: Path) -> None:
 def test_rendered_images_are_no_files_for_colmap(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     small = "gallery:views=1,queries=1,rooms=1,width=64,height=48,detail=0.1"
     assert export("--dataset", small, "--layout", "colmap", "--out", tmp_path / "x.db") == 2
-    assert "this dataset is rendered; write it by `bench dataset` first" in capfd.readouterr().err
+    assert "write a rendered dataset by `bench dataset` first" in capfd.readouterr().err
 
 
 # ---- COLMAP

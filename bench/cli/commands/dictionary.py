@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from bench.cli.terminal import DONE, add_extractor, add_seed, parse_whole, require
+from bench.cli.terminal import DONE, add_extractor, add_images, add_seed, parse_whole, require
 from bench.core.errors import UserError, unknown_name
 
 SUMMARY = "build a dictionary of descriptors: bench dictionary build"
@@ -14,7 +14,7 @@ REQUIRED = ()
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("what", nargs="?", type=_parse_action, metavar="build", help="cluster the descriptors of a folder")
-    parser.add_argument("--images", type=Path, metavar="DIR", help="a folder of photographs")
+    add_images(parser)
     parser.add_argument("--size", type=parse_whole, metavar="K", help="number of words")
     parser.add_argument("--out", type=Path, metavar="FILE", help="a new safetensors file")
     add_seed(parser, "the clustering")

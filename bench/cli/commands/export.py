@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Final, get_args
 
-from bench.cli.terminal import DONE, FAILED, add_extractor, add_seed, print_status
+from bench.cli.terminal import DONE, FAILED, add_extractor, add_images, add_seed, print_status
 from bench.core.errors import UserError
 
 SUMMARY = "write features, releases or recovered descriptors for hloc or COLMAP"
@@ -29,7 +29,7 @@ CAMERA_MODE: Final = "per_image"
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--images", type=Path, metavar="DIR", help="a folder of photographs")
+    add_images(parser)
     parser.add_argument("--full-images", action="store_true", help="read the whole photographs, not only their central squares")
     parser.add_argument("--dataset", metavar="SPEC", help="a scene in place of --images: its references and its queries")
     parser.add_argument("--layout", metavar="hloc|colmap", help="an HDF5 file for hloc, or a database for COLMAP")

@@ -5,10 +5,11 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from bench.cli.terminal import DONE, FAILED, add_extractor, add_seed, parse_whole, print_rich, print_status
+from bench.cli.terminal import DONE, FAILED, add_extractor, add_images, add_seed, parse_whole, print_rich, print_status
 
 SUMMARY = "reproduce a table of the paper, or its figures, beside the published values"
 EPILOG = """Each table shows intervals over the photographs, and a verdict on each claim of the paper.
+With --profile paper, it first names the data of the paper that are replaced by our own, and the commands that download them.
 
 examples:
   bench reproduce table1
@@ -27,7 +28,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         default="cpu",
         help="smoke, cpu, dense or paper: the size of the experiment (default: %(default)s)",
     )
-    parser.add_argument("--images", type=Path, metavar="DIR", help="a folder of photographs (default: the built-in ones)")
+    add_images(parser, "the built-in ones")
     parser.add_argument("--dataset", metavar="SPEC", help="the scene, for tables about localization (default: a gallery)")
     parser.add_argument(
         "--workers", type=parse_whole, metavar="N", help="worker processes, for tables about localization (default: one per core)"
@@ -57,6 +58,10 @@ def execute(args: argparse.Namespace) -> int:
     from leaderboard import reproduce
 
     materials = {name: getattr(args, name) for name in reproduce.list_materials() if getattr(args, name)}
+    if args.profile == "paper":
+        given = {*materials, *(name for name in ("images", "dataset") if getattr(args, name) is not None)}
+        for line in reproduce.list_missing(args.what, given):
+            print_status(DONE, f"not the paper's: {line}")
     done = reproduce.reproduce(
         args.what,
         args.profile,

@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bench.cli.terminal import DONE, FAILED, add_engine, add_extractor, add_seed, print_status
+from bench.cli.terminal import DONE, FAILED, add_engine, add_extractor, add_images, add_seed, print_status
 from bench.core.errors import UserError
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="a metric that needs a file; all other metrics are always computed",
     )
     add_extractor(parser)
-    parser.add_argument("--images", type=Path, metavar="DIR", help="a folder of photographs (default: seven built-in ones)")
+    add_images(parser, "seven built-in ones")
     parser.add_argument(
         "--dataset", metavar="SPEC", help="the scene of the task (default: that of the task; see bench list datasets)"
     )

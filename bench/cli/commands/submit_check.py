@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from bench.cli.terminal import DONE, FAILED, add_seed, parse_whole, print_status
+from bench.cli.terminal import DONE, FAILED, add_images, add_seed, parse_whole, print_status
 
 SUMMARY = "check submitted records: schema, hashes, ranges, applicability and duplicates; recompute a sample of them"
 EPILOG = """The attack of a recomputed record runs in a process that never holds the secret. Its plugins must be installed.
@@ -22,7 +22,7 @@ REQUIRED = ("records",)
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("records", nargs="?", type=Path, metavar="FILE", help="a file of records, or a folder of bench run")
-    parser.add_argument("--images", type=Path, metavar="DIR", help="the photographs (default: the built-in ones)")
+    add_images(parser, "the built-in ones")
     parser.add_argument(
         "--file",
         type=Path,

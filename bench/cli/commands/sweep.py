@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from bench.cli.terminal import DONE, FAILED, add_engine, print_status
+from bench.cli.terminal import DONE, FAILED, add_engine, add_images, print_status
 from bench.core.errors import UserError
 
 SUMMARY = "run a suite of experiments, on one machine or many; finished records are not computed again"
@@ -22,7 +22,7 @@ REQUIRED = ()
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("suite", nargs="?", metavar="SUITE", help="the suite; without it, all suites are listed")
-    parser.add_argument("--images", type=Path, metavar="DIR", help="a folder of photographs (default: those of the suite)")
+    add_images(parser, "those of the suite")
     add_engine(parser)
     parser.add_argument(
         "--out", type=Path, metavar="DIR", help="folder for the results; resumed if it exists (default: a folder in runs/)"

@@ -6,7 +6,7 @@ import argparse
 import dataclasses
 from pathlib import Path
 
-from bench.cli.terminal import DONE, add_extractor, add_seed, parse_whole, parse_wholes
+from bench.cli.terminal import DONE, add_extractor, add_images, add_seed, parse_whole, parse_wholes
 
 SUMMARY = "train, or resume, an attacker's inversion network for the releases of a defense"
 REQUIRED = ("defense", "images", "out")
@@ -19,13 +19,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="SPEC",
         help="the defense; fields not given are trained over their supported range. May be repeated: one network for all of them",
     )
-    parser.add_argument("--images", type=Path, metavar="DIR", help="a folder of photographs")
+    add_images(parser)
     parser.add_argument("--out", type=Path, metavar="FILE", help="the network's weights, a safetensors file")
     parser.add_argument(
         "--validation",
         type=Path,
         metavar="DIR|LIST",
-        help="a folder of other photographs, or a text file with names of photographs in --images (default: every 20th)",
+        help="other photographs as for --images, or a text file with names of photographs in --images (default: every 20th)",
     )
     parser.add_argument(
         "--crossfit",
