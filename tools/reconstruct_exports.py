@@ -45,8 +45,8 @@ intrinsics nor poses.
 
 In rows without an attack, the database holds the released descriptors: each word of a set is a keypoint of its own. In the
 others it holds the descriptors that the attack recovers. `ldp` has ε = 10, and `affine` hybrid lifting of dimension 4. Keypoints
-are those of all views. The attack `database` has no row: it recovers descriptors with negative components, which COLMAP's 8-bit databases
-cannot hold.
+are those of all views. The attack `database` has no row: it recovers descriptors with negative components, which COLMAP's
+8-bit databases cannot hold.
 
 """
 
