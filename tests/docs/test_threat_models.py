@@ -63,7 +63,7 @@ def test_every_kind_of_knowledge_is_explained() -> None:
 
 def list_missing(page: str) -> set[str]:
     """Return the names of the built-in attacks and defenses that have no row in their tables, or have a row and do not exist."""
-    defenses = {plugin.name() for plugin in discovery.load_plugins(discovery.DEFENSE) if plugin.__module__.startswith("defenses.")}
+    defenses = {one.name() for one in discovery.load_plugins(discovery.DEFENSE) if one.__module__.startswith("defenses.")}
     return (ATTACKS.keys() ^ list_rows(page, "Attacks")) | (defenses ^ list_rows(page, "Defenses"))
 
 
