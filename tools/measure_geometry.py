@@ -25,14 +25,11 @@ from leaderboard.intervals import interval
 
 TITLE = """# Defenses that hide positions
 
-Releases of the seven built-in photographs, 256 by 256 pixels, upright SIFT, seed 0. `lines` releases a random line through each
-keypoint, `permutation` one of its two coordinates. Keypoints are in random order. In brackets: 95% intervals of Student's t over
-photographs.
+Releases of the seven built-in photographs, 256 by 256 pixels, upright SIFT, seed 0. [Hidden positions](../geometry.md) describes
+the defenses and attacks. In brackets: 95% intervals of Student's t over photographs, which can exceed the range of a metric.
 
-`neighbourhood-oracle` knows the true neighbours, which no attacker does. `neighbourhood` predicts them from the released
-descriptors by a small model; its settings were chosen on `tune.txt`. The image is reconstructed by `dia` from the recovered
-positions, with the network that was trained for true positions. It is not adapted to errors of positions, so the scores of images
-are no upper bound of the leakage.
+The settings of `neighbourhood` were chosen on other photographs. `dia` reconstructs the image from the recovered positions. Its
+network was trained on true positions and not on their errors, so the scores of images are lower bounds of the leakage.
 """
 PLAIN = {"none": ("dia", "keypoints")}
 HIDDEN = ("lines", "permutation")
@@ -85,6 +82,8 @@ def write_attacks(results: Mapping[tuple[str, str], Sequence[Record]]) -> str:
         "## Attacks on positions",
         "",
         "*position error*: median distance of a photograph's keypoints to their recovered positions, in pixels.",
+        "*identified*: [reciprocal rank](../method.md#identification) of the photograph among 256. Both: means over photographs.",
+        "A random order has 0.024. The constant image of `blank` has rank 128.5, and so 0.008.",
         "",
         markdown_row(("defense", "attack", "position error", "SSIM", "PSNR", "identified")),
         markdown_row(["---"] * 6),
@@ -104,8 +103,9 @@ def write_localization(results: Mapping[str, Sequence[Record]]) -> str:
     lines = [
         "## Localization",
         "",
-        f"Dataset `{SCENE}`: a small scene, so differences of a few queries mean nothing. Fraction of queries within the "
-        "thresholds, and medians over the localized queries.",
+        f"Dataset `{SCENE}`, a rendered building. A difference of one or two of its queries is no evidence.",
+        "A query is *localized* if a pose was found. Columns with thresholds: fractions of all queries. Errors: medians over",
+        "the localized ones. *matches* and *trials* (of RANSAC; 0 without a pose) are medians over all queries.",
         "",
         markdown_row(
             ("defense", "queries", "localized", *RECALLS.values(), "error in m", "error in degrees", "matches", "trials")

@@ -39,10 +39,14 @@ EXPORTS: tuple[tuple[str, str | None], ...] = (
 )
 TEXT = f"""# Exports in COLMAP
 
-`bench export --full-images --layout colmap --camera-mode single` wrote a database of {VIEWS} views of the gallery's courtyard
-(`walk:views={VIEWS}`, 640 by 480 pixels) for each row. COLMAP matched all pairs and built a model without intrinsics and poses. A
-row without an attack holds all released descriptors: each word of a set is a keypoint of its own. The
-attack `database` has no row: it recovers descriptors with negative components, which COLMAP's 8-bit databases cannot hold.
+Each row is one COLMAP database of {VIEWS} rendered views (`walk:views={VIEWS}`, 640 by 480 pixels). It was written by
+`bench export --full-images --layout colmap --camera-mode single`. COLMAP matched all pairs and built a model. It received neither
+intrinsics nor poses.
+
+In rows without an attack, the database holds the released descriptors: each word of a set is a keypoint of its own. In the
+others it holds the descriptors that the attack recovers. `ldp` has ε = 10, and `affine` hybrid lifting of dimension 4. Keypoints
+are those of all views. The attack `database` has no row: it recovers descriptors with negative components, which COLMAP's
+8-bit databases cannot hold.
 
 """
 

@@ -1,4 +1,4 @@
-"""The table of docs/threat-models.md has the release types and the knowledge that each attack declares."""
+"""docs/threat-models.md has the release types and the knowledge that each attack declares; docs/attacks.md lists the plugins."""
 
 import re
 from pathlib import Path
@@ -11,7 +11,9 @@ from bench.registry import discovery
 from bench.threat_model import Knowledge
 from bench.types import Descriptors, Release, Subspaces, WordSets
 
-PAGE = (Path(__file__).resolve().parents[2] / "docs" / "threat-models.md").read_text(encoding="utf-8")
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+PAGE = (DOCS / "threat-models.md").read_text(encoding="utf-8")
+LIST = (DOCS / "attacks.md").read_text(encoding="utf-8")
 RELEASES: dict[str, type[Release]] = {"descriptors": Descriptors, "subspaces": Subspaces, "word sets": WordSets}
 ATTACKS = {
     attack.name(): attack for attack in discovery.load_plugins(discovery.ATTACK) if attack.__module__.startswith("attacks.")
@@ -57,3 +59,24 @@ def test_a_wrong_row_is_noticed(old: str, new: str) -> None:
 def test_every_kind_of_knowledge_is_explained() -> None:
     kinds = {name for name, kind in vars(threat_model).items() if isinstance(kind, type) and issubclass(kind, Knowledge)}
     assert set(re.findall(r"^\| `(\w+)` \|", PAGE, re.MULTILINE)) == kinds - {"Knowledge"}
+
+
+def list_missing(page: str) -> set[str]:
+    """Return the names of the built-in attacks and defenses that have no row in their tables, or have a row and do not exist."""
+    defenses = {one.name() for one in discovery.load_plugins(discovery.DEFENSE) if one.__module__.startswith("defenses.")}
+    return (ATTACKS.keys() ^ list_rows(page, "Attacks")) | (defenses ^ list_rows(page, "Defenses"))
+
+
+def list_rows(page: str, title: str) -> set[str]:
+    """Return the names in the first column of a section's table."""
+    section = page.partition(f"\n## {title}\n")[2].partition("\n## ")[0]
+    return set(re.findall(r"^\| `([a-z-]+)` \|", section, re.MULTILINE))
+
+
+def test_every_plugin_is_listed() -> None:
+    assert list_missing(LIST) == set()
+
+
+@pytest.mark.parametrize("name", ["snap", "permutation"])
+def test_a_missing_plugin_is_noticed(name: str) -> None:
+    assert list_missing(LIST.replace(f"| `{name}` |", "| `other` |")) == {name, "other"}

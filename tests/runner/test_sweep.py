@@ -458,7 +458,7 @@ def test_interrupted_sweep_resumes(mine: str, monkeypatch: pytest.MonkeyPatch, c
 DOCUMENT = (Path(__file__).resolve().parents[2] / "docs" / "running.md").read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize("line", re.findall(r"^bench (.+?)(?:\s+#.*)?$", DOCUMENT, re.MULTILINE))
+@pytest.mark.parametrize("line", re.findall(r"^bench (.+?)(?:\s+#.*)?$", DOCUMENT.replace("\\\n", ""), re.MULTILINE))
 def test_commands_of_the_documentation_parse(line: str) -> None:
     args, extra = cli.build_parser().parse_known_args(line.split())
     assert not extra
