@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from bench.api import Defense, Plugin
+from bench.api import Defense, Metric, Plugin
 from bench.codebook.public import SHIPPED
 from bench.core.errors import UserError
 from bench.registry import discovery, fields
@@ -88,7 +88,7 @@ def _list_metrics(lookup: Lookup, settings: Mapping[str, Mapping[str, Any]], nee
     """Yield the metrics that are measured only on request."""
     for name, content in settings.items():
         plugin = lookup(discovery.METRIC, name)
-        if plugin and fields.list_required(plugin):
+        if plugin is not None and issubclass(plugin, Metric) and fields.is_optional(plugin):
             yield _write_spec(lookup, discovery.METRIC, {"name": name, **content}, needs)
 
 

@@ -42,7 +42,7 @@ COMPOSITION_REMARK = (
 )
 MAX_FAILURES = 10  # failures that are listed
 MOST_DIGITS, LARGE = 1e4, 1e7  # numbers between these are written with all digits
-FILE_ONLY_COLUMNS = ("MSE", "angle", "l2")  # a terminal has no room for them
+FILE_ONLY_COLUMNS = ("MSE", "angle", "identity-distance", "l2")  # a terminal has no room for them
 
 
 def build_tables(records: Iterable[Record], *, brief: bool = False, foldable: bool = False) -> list[Table]:
