@@ -1,7 +1,8 @@
 """Calibration of the metrics `identity`, `identity-distance` and `perceptual` on pairs with known answers.
 
-The photographs are two portraits from the wheels of scikit-image and matplotlib. The non-matching faces are the 100 of scikit-image's
-subset of Labeled Faces in the Wild (25 x 25 pixels), put in place of each portrait's face. The page is docs/results/identity.md.
+The photographs are two portraits from the wheels of scikit-image and matplotlib. The non-matching faces are the 100 of
+scikit-image's subset of Labeled Faces in the Wild (25 x 25 pixels), put in place of each portrait's face. The page is
+docs/results/identity.md.
 
     python tools/measure_identity.py
 """
@@ -42,8 +43,9 @@ from metrics.ssim import SSIM
 
 TEXT = """# Identity and perceptual distance: calibration
 
-[Metrics of optional extras](../metrics.md) describes the metrics. Distances are those of `identity-distance`; below 0.6, two faces
-count as one person. `identified` is the metric `identity`.
+[Metrics of optional extras](../method.md#metrics-of-optional-extras) describes the metrics. Distances are those of
+`identity-distance`: below 0.6, two faces count as one person. `identified` is the metric `identity`. A blur is Gaussian, with its
+standard deviation.
 
 ## Pairs with known answers
 
@@ -51,15 +53,16 @@ count as one person. `identified` is the metric `identity`.
 
 ## Non-matching faces
 
-The faces are the 100 of scikit-image's subset of Labeled Faces in the Wild (25 by 25 pixels, grey). Each replaces the face of both
-portraits. The pictures without a face are the other 100 of that subset. The noise fills the image.
+The faces are the 100 of scikit-image's subset of Labeled Faces in the Wild (25 by 25 pixels, grey). Each replaces the face of
+both portraits. The pictures without a face are the other 100 of that subset. The noise fills the image. The rate of false
+acceptance has Wilson's interval.
 
 {non_matching}
 
 ## Reconstructions
 
-The shipped networks reconstruct the two portraits from upright SIFT features, with seed 0. Two faces are an example, and no estimate
-of a rate.
+The shipped networks reconstruct the two portraits from upright SIFT features, with seed 0. Two faces are an example, and no
+estimate of a rate.
 
 {reconstructions}
 
@@ -118,7 +121,7 @@ def list_known_pairs(portrait: Floats, other: Floats) -> dict[str, Floats]:
     """Return estimates of a portrait with known answers."""
     return {
         "itself": portrait,
-        **{f"blurred, σ = {sigma} pixels": blur(portrait, sigma) for sigma in (1, 2, 4)},
+        **{f"blur of {sigma} pixels": blur(portrait, sigma) for sigma in (1, 2, 4)},
         "the other portrait": other,
         "grey": np.full_like(portrait, 0.5),
         "white noise": next(draw_noises()),
@@ -198,7 +201,7 @@ def main() -> None:
     pairs = {name: [pair[name] for pair in known] for name in known[0]}
     non_matching = {name: list(measure_acceptance(portraits, draw)) for name, draw in list_non_matching().items()}
     reconstructions = reconstruct(sources)
-    columns = ("estimate", "pairs", "face detected", "median distance", "least distance", "below 0.6", "identified")
+    columns = ("estimate", "pairs", "face detected", "median distance", "least distance", "below 0.6", "identified", "rate")
     text = TEXT.format(
         pairs=build_table(["estimate", *scores], [(name, *compare(portraits, pairs[name])) for name in pairs]),
         non_matching=build_table(

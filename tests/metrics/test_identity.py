@@ -64,7 +64,7 @@ def test_pairs_with_known_answers(
 ) -> None:
     pairs = list_known_pairs(portrait, other)
     identified = {name: identity(portrait, estimate) for name, estimate in pairs.items()}
-    same = ["itself", "blurred, σ = 1 pixels", "blurred, σ = 2 pixels"]
+    same = ["itself", "blur of 1 pixels", "blur of 2 pixels"]
     assert identified == {name: float(name in same) for name in pairs}
     distances = [distance(portrait, pairs[name]) for name in same]
     assert distances[0] == 0
@@ -116,7 +116,7 @@ def test_a_face_that_is_near_but_undetected_is_not_identified(identity: Identity
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("count", [12, pytest.param(100, marks=pytest.mark.exhaustive)])
+@pytest.mark.parametrize("count", [6, pytest.param(100, marks=pytest.mark.exhaustive)])
 def test_few_other_faces_are_accepted(identity: Identity, count: int) -> None:
     """Of 100 faces in place of the astronaut's, at most 3: the rate on 200 pairs is 1%."""
     estimates = [replace_face(ASTRONAUT, face) for face in list_other_pictures()[0][:count]]
