@@ -204,9 +204,7 @@ def main() -> None:
     columns = ("estimate", "pairs", "face detected", "median distance", "least distance", "below 0.6", "identified", "rate")
     text = TEXT.format(
         pairs=build_table(["estimate", *scores], [(name, *compare(portraits, pairs[name])) for name in pairs]),
-        non_matching=build_table(
-            [*columns, "rate, with Wilson's interval"], [(name, *row) for name, row in non_matching.items()]
-        ),
+        non_matching=build_table(columns, [(name, *row) for name, row in non_matching.items()]),
         reconstructions=build_table(
             ["reconstruction", *scores], [(name, *compare(portraits, images)) for name, images in reconstructions.items()]
         ),

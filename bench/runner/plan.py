@@ -131,13 +131,14 @@ def build_plan(configuration: RunConfiguration, describe: Describe = environment
     metrics = (*_default_metrics(), *configuration.metrics) if task.judges_attacks else ()
     if collection.scene is None:
         metrics = tuple(metric for metric in metrics if metric.compares != "views")
+    settings = {metric: _settings(metric) for metric in metrics}  # once, since digests of large files take time
     attacks = [attack for _, attack in configuration.pairs if attack is not None]
     plugins = [*attacks, *(part for defense, _ in configuration.pairs for part in composed.list_parts(defense))]
     environment_record = dict(describe([task, extractor, *plugins, *metrics]))
     experiments = []
     for defense, attack in configuration.pairs:
         defense_record = spec.to_json_with_digests(defense, public)
-        metric_settings = {metric.name(): _settings(metric) for metric in select_metrics(metrics, defense)}
+        metric_settings = {metric.name(): settings[metric] for metric in select_metrics(metrics, defense)}
         reason = _explain_hidden_positions(task, defense) or task.explain_not_applicable(defense, attack, extractor, public)
         attack_record = _attack_record(task, defense, attack, extractor, public, reason)
         experiment_id = records.experiment_id(

@@ -13,7 +13,7 @@ from bench import testing
 from bench.api import Metric
 from bench.core.errors import UserError
 from bench.identification import face_embedding
-from bench.identification.face_embedding import ComparedFaces, FaceMetric
+from bench.identification.face_embedding import ComparedFaces
 from bench.images import photographs
 from bench.registry import discovery
 from metrics.identity import Identity
@@ -40,21 +40,23 @@ def distance() -> IdentityDistance:
         pytest.skip(str(error))
 
 
-def embed_aligned(metric: FaceMetric, image: np.ndarray, box: Any) -> np.ndarray:
-    """Return the embedding of a chip that dlib aligns, cut and embedded by separate calls."""
+def embed_aligned(models: tuple[Any, Any], image: np.ndarray, box: Any) -> np.ndarray:
+    """Return the embedding of a face that dlib cuts out and aligns by a separate call."""
+    predictor, network = models
     pixels = np.rint(image * 255).astype(np.uint8)
-    chip = dlib.get_face_chip(pixels, dlib.shape_predictor(str(metric.landmarks))(pixels, box), size=150, padding=0.25)
-    return np.array(dlib.face_recognition_model_v1(str(metric.network)).compute_face_descriptor(chip))
+    chip = dlib.get_face_chip(pixels, predictor(pixels, box), size=150, padding=0.25)
+    return np.array(network.compute_face_descriptor(chip))
 
 
 @pytest.mark.slow
 def test_distances_are_those_of_dlib(distance: IdentityDistance) -> None:
+    models = dlib.shape_predictor(str(distance.landmarks)), dlib.face_recognition_model_v1(str(distance.network))
     (box,) = dlib.get_frontal_face_detector()(np.rint(ASTRONAUT * 255).astype(np.uint8), 1)
     for name, estimate in list_known_pairs(ASTRONAUT, ADMIRAL).items():
-        expected = np.linalg.norm(embed_aligned(distance, ASTRONAUT, box) - embed_aligned(distance, estimate, box))
+        expected = np.linalg.norm(embed_aligned(models, ASTRONAUT, box) - embed_aligned(models, estimate, box))
         assert distance(ASTRONAUT, estimate) == pytest.approx(expected, abs=1e-5), name
     turned = dlib.rectangle(box.top(), box.left(), box.bottom(), box.right())  # control: rows and columns exchanged
-    assert np.linalg.norm(embed_aligned(distance, ASTRONAUT, box) - embed_aligned(distance, ASTRONAUT, turned)) > 0.3
+    assert np.linalg.norm(embed_aligned(models, ASTRONAUT, box) - embed_aligned(models, ASTRONAUT, turned)) > 0.3
 
 
 @pytest.mark.slow

@@ -48,6 +48,7 @@ def test_an_extra_that_lacks_a_package_is_left_out(installed: None, monkeypatch:
     assert [metric.name() for metric in list_extra_metrics()] == ["perceptual"]
 
 
+@pytest.mark.slow
 def test_a_suite_chooses_them_and_another_plan_does_not(installed: None, monkeypatch: pytest.MonkeyPatch, images: Path) -> None:
     (part,) = suite.grid(defenses=[Undefended()], attacks=[Sketch()], images=images)
     assert tuple(metric.name() for metric in part.metrics) == EXTRAS
