@@ -98,7 +98,7 @@ def _write_spec(
 ) -> str:
     """Return a plugin's specification without fields at their defaults. `bench run` itself fills `scene_field`."""
     plugin = lookup(kind, configuration["name"])
-    defaults = _list_defaults(plugin) if plugin else {}
+    defaults = _list_defaults(plugin) if plugin else {}  # type: ignore[arg-type]  # a class is hashable
     given = []
     for field, value in configuration.items():
         if field == "name" or isinstance(value, dict) or (plugin and field not in fields.resolve_types(plugin)):
