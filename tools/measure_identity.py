@@ -28,6 +28,7 @@ from bench.identification import face_embedding
 from bench.images import photographs
 from bench.images.photographs import Source
 from bench.runner.plan import RunConfiguration, build_plan, cross
+from bench.runner.records import Record
 from bench.runner.trial import TrialRunner
 from bench.tasks.reconstruction import Reconstruction
 from bench.types import Bytes, Floats
@@ -138,8 +139,8 @@ def list_non_matching() -> dict[str, Callable[[Floats], Iterator[Floats]]]:
     }
 
 
-def reconstruct(sources: list[Source]) -> dict[str, list[Floats]]:
-    """Return the reconstructions of each experiment, one for each photograph."""
+def reconstruct(sources: list[Source]) -> tuple[dict[str, list[Floats]], list[Record]]:
+    """Return the reconstructions of each experiment, one for each photograph, and the configurations."""
     task = Reconstruction()
     defenses: list[Defense] = [Undefended(), Affine(), LDP(epsilon=16), LDP()]
     pairs = (*cross(task, defenses, [DIA()]), (Undefended(), Keypoints()))
@@ -150,7 +151,8 @@ def reconstruct(sources: list[Source]) -> dict[str, list[Floats]]:
     for experiment, (defense, attack) in zip(plan.experiments, labels, strict=True):
         outcomes = [plan.task.evaluate(runner.build_trial(experiment, sample)) for sample in plan.samples]
         images[f"`{attack}` on `{defense}`"] = [outcome.image for outcome in outcomes if outcome.image is not None]
-    return images
+    configurations = [experiment.metadata[part] for experiment in plan.experiments for part in ("defense", "attack")]
+    return images, configurations
 
 
 def compare(portraits: Sequence[Floats], estimates: Sequence[Floats]) -> Iterator[str]:
@@ -200,7 +202,7 @@ def main() -> None:
     known = [list_known_pairs(portrait, other) for portrait, other in (portraits, portraits[::-1])]
     pairs = {name: [pair[name] for pair in known] for name in known[0]}
     non_matching = {name: list(measure_acceptance(portraits, draw)) for name, draw in list_non_matching().items()}
-    reconstructions = reconstruct(sources)
+    reconstructions, configurations = reconstruct(sources)
     columns = ("estimate", "pairs", "face detected", "median distance", "least distance", "below 0.6", "identified", "rate")
     text = TEXT.format(
         pairs=build_table(["estimate", *scores], [(name, *compare(portraits, pairs[name])) for name in pairs]),
@@ -210,7 +212,7 @@ def main() -> None:
         ),
         seconds=build_table(["metric", "seconds for a photograph"], measure_seconds(portraits[0]).items()),
     )
-    write_page("identity.md", text, [])
+    write_page("identity.md", text, configurations)
 
 
 if __name__ == "__main__":
