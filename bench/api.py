@@ -264,6 +264,8 @@ class Metric(Plugin, ABC):
     higher_is_better_for: ClassVar[Literal["attacker", "defender"]]
     # Parameters that the formula leaves open, as records hold them.
     parameters: ClassVar[Mapping[str, Any]] = {}
+    # Distributions of an optional extra. Where all are installed, `bench run` and suites compute the metric.
+    packages: ClassVar[tuple[str, ...]] = ()
 
     @classmethod
     def description(cls) -> str:

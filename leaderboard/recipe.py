@@ -8,10 +8,11 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from bench.api import Defense, Plugin
+from bench.api import Defense, Metric, Plugin
 from bench.codebook.public import SHIPPED
 from bench.core.errors import UserError
-from bench.registry import discovery, fields
+from bench.formats.pretrained import INSTALLED
+from bench.registry import discovery, fields, spec
 from bench.registry.discovery import Kind
 from bench.task_api import Task
 from leaderboard import provenance
@@ -45,24 +46,24 @@ def build_recipe(experiment: GroupedExperiment, lookup: Lookup = find_plugin) ->
     The user's own files appear as FILE, and `needs` states their digests. The specification of a plugin that is not installed has
     all recorded fields. Many experiments can share a cached `lookup`.
     """
-    metadata, spec = experiment.metadata, functools.partial(_write_spec, lookup)
+    metadata, write = experiment.metadata, functools.partial(_write_spec, lookup)
     needs: dict[str, None] = {}
     task = {"name": metadata["task"], **(metadata.get("task_settings") or {})}
     options = [
-        ("--task", spec(discovery.TASK, task, needs)),
+        ("--task", write(discovery.TASK, task, needs)),
         (
             "--defense",
             "+".join(
-                spec(discovery.DEFENSE, part, needs, _find_scene_field(lookup, metadata["task"], part))
+                write(discovery.DEFENSE, part, needs, _find_scene_field(lookup, metadata["task"], part))
                 for part in metadata["defense"].get("parts", [metadata["defense"]])
             ),
         ),
     ]
     if metadata["attack"] is not None:
-        options.append(("--attack", spec(discovery.ATTACK, metadata["attack"], needs)))
-    options.append(("--extractor", spec(discovery.EXTRACTOR, metadata["dataset"]["extractor"], needs)))
+        options.append(("--attack", write(discovery.ATTACK, metadata["attack"], needs)))
+    options.append(("--extractor", write(discovery.EXTRACTOR, metadata["dataset"]["extractor"], needs)))
     if metadata["dataset"].get("spec"):
-        options.append(("--dataset", spec(discovery.DATASET, metadata["dataset"]["spec"], needs)))
+        options.append(("--dataset", write(discovery.DATASET, metadata["dataset"]["spec"], needs)))
     elif metadata["dataset"]["name"] != BUILTIN:
         options.append(("--images", str(metadata["dataset"]["name"])))
         needs[f"{metadata['dataset']['name']}: a folder of the photographs with the content {metadata['dataset']['hash']}"] = None
@@ -88,7 +89,7 @@ def _list_metrics(lookup: Lookup, settings: Mapping[str, Mapping[str, Any]], nee
     """Yield the metrics that are measured only on request."""
     for name, content in settings.items():
         plugin = lookup(discovery.METRIC, name)
-        if plugin and fields.list_required(plugin):
+        if plugin is not None and issubclass(plugin, Metric) and fields.is_optional(plugin):
             yield _write_spec(lookup, discovery.METRIC, {"name": name, **content}, needs)
 
 
@@ -97,7 +98,7 @@ def _write_spec(
 ) -> str:
     """Return a plugin's specification without fields at their defaults. `bench run` itself fills `scene_field`."""
     plugin = lookup(kind, configuration["name"])
-    defaults = fields.list_defaults(plugin) if plugin else {}
+    defaults = _list_defaults(plugin) if plugin else {}  # type: ignore[arg-type]  # a class is hashable
     given = []
     for field, value in configuration.items():
         if field == "name" or isinstance(value, dict) or (plugin and field not in fields.resolve_types(plugin)):
@@ -110,6 +111,18 @@ def _write_spec(
             if text == "FILE":
                 needs[f"FILE for {field} of {configuration['name']}: {value}"] = None
     return configuration["name"] + (":" + ",".join(given) if given else "")
+
+
+@functools.cache
+def _list_defaults(plugin: type[Plugin]) -> dict[str, Any]:
+    """Return the defaults of a plugin's fields. Those that are files of an installed package are digests, as in records."""
+    defaults = fields.list_defaults(plugin)
+    if INSTALLED not in defaults.values():
+        return defaults
+    try:
+        return spec.to_json(plugin())
+    except (TypeError, UserError):  # a field is required, or the package is not installed
+        return defaults
 
 
 def _format_value(value: Any) -> str:

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from bench.api import Defense, Plugin
+from bench.api import Defense, Metric, Plugin
 from bench.codebook.clustered import name_digest
 from bench.codebook.public import ASSETS, CLUSTERED, REFERENCES, SHIPPED
 from bench.core import strict_json
@@ -236,7 +236,15 @@ def _build_configuration(record: Record, inputs: _LocalInputs) -> RunConfigurati
         extractor=inputs.plugin(discovery.EXTRACTOR, record["dataset"]["extractor"]),
         dataset=None if dataset is None else inputs.plugin(discovery.DATASET, dataset),
         seed=record["seed"],
+        metrics=tuple(_build_metrics(record["metric_settings"], inputs)),
     )
+
+
+def _build_metrics(settings: Mapping[str, Mapping[str, Any]], inputs: _LocalInputs) -> Iterator[Metric]:
+    """Yield the metrics of a record that not every run computes: those that need a setting or an optional extra."""
+    for name in settings.keys() & discovery.discover(discovery.METRIC).keys():
+        if fields.is_optional(discovery.load_plugin(discovery.METRIC, name)):
+            yield inputs.plugin(discovery.METRIC, {"name": name, **settings[name]})
 
 
 def _check_experiment(experiment: Experiment, members: Sequence[NumberedRecord], plan: Plan) -> Iterator[Fault]:

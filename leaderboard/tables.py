@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -42,7 +42,7 @@ COMPOSITION_REMARK = (
 )
 MAX_FAILURES = 10  # failures that are listed
 MOST_DIGITS, LARGE = 1e4, 1e7  # numbers between these are written with all digits
-FILE_ONLY_COLUMNS = ("MSE", "angle", "l2")  # a terminal has no room for them
+FILE_ONLY_COLUMNS = ("MSE", "angle", "identity-distance", "l2")  # a terminal has no room for them
 
 
 def build_tables(records: Iterable[Record], *, brief: bool = False, foldable: bool = False) -> list[Table]:
@@ -124,7 +124,7 @@ def _build_table(records: list[Record], brief: bool, foldable: bool) -> Table:
     heading = _describe_samples(records)
     failures = _list_failures(experiments, labels)
     chance = [explain_identification(name) for name in metrics if name in IDENTIFICATION]
-    remarks = [*_list_signal_remarks(signals), COMPOSITION_REMARK, SEED_REMARK]
+    remarks = [*_count_values(records, metrics), *_list_signal_remarks(signals), COMPOSITION_REMARK, SEED_REMARK]
     return Table(
         heading=heading,
         columns=tuple(Column(label=label, text=name in ("defense", "attack", "note")) for name, label in columns.items()),
@@ -228,6 +228,17 @@ def _explain_metrics(metrics: Sequence[str]) -> list[str]:
     """Return the descriptions of all metrics but those of identification, which have a remark."""
     plugins = {plugin.name(): plugin for plugin in discovery.load_plugins(discovery.METRIC)}
     return [f"{name}: {plugins[name].description()}" for name in metrics if name in plugins and name not in IDENTIFICATION]
+
+
+def _count_values(records: list[Record], metrics: Sequence[str]) -> Iterator[str]:
+    """Yield the number of samples with a value, for each metric of an optional extra that some samples have no value of."""
+    extras = {plugin.name() for plugin in discovery.load_plugins(discovery.METRIC) if plugin.packages}
+    for name in metrics:
+        if name in extras:
+            values = [(record["sample"], record["metrics"].get(name)) for record in records if record["status"] == "ok"]
+            every, known = {sample for sample, _ in values}, {sample for sample, value in values if value is not None}
+            if known != every:
+                yield f"{name}: over the {len(known)} of {len(every)} {name_samples(records[0]['task'], 2)} that have a value."
 
 
 def _list_notes(records: list[Record], completed: list[Record], signal: Signal | None) -> list[str]:

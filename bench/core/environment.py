@@ -11,7 +11,7 @@ import importlib.util
 import inspect
 import platform
 from collections.abc import Iterable
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +46,15 @@ def describe_platform() -> dict[str, Any]:
 def list_library_versions() -> dict[str, str]:
     """Return the versions of the libraries that results depend on."""
     return {library: version(library) for library in LIBRARIES}
+
+
+def is_installed(distribution: str) -> bool:
+    """Return whether a distribution is installed, without importing it."""
+    try:
+        version(distribution)
+    except PackageNotFoundError:
+        return False
+    return True
 
 
 def hash_source(plugins: Iterable[object]) -> str:

@@ -44,7 +44,8 @@ def run(
     task : `Reconstruction()` if None
     dataset : the scene, for a task that needs one
     seed : seed of all random numbers. A release with a known seed is for measurements and protects nobody.
-    metrics : metrics that need a setting, such as a file; all other metrics are always computed
+    metrics : metrics that need a setting, such as a file, or an optional extra, such as `list_extra_metrics()` of
+        `bench.runner.plan`; all other metrics are always computed
     out : a folder for records and reconstructions; finished records in it are not computed again
 
     Raises

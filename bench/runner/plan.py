@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -20,6 +21,9 @@ from bench.task_api import Execute, Task, execute_in_process
 from bench.threat_model import ServerMap
 from bench.types import Points
 
+VARIABLE = "FEATURE_PRIVACY_EXTRA_METRICS"  # environment variable
+NO_EXTRAS = "none"  # its value for runs whose records are the same in all installations
+
 Describe = Callable[[Iterable[object]], Mapping[str, Any]]  # plugins -> the environment that executes them
 
 
@@ -33,7 +37,7 @@ class RunConfiguration:
     extractor: Extractor
     dataset: Dataset | None
     seed: int
-    metrics: tuple[Metric, ...] = ()  # in addition to those that need no setting
+    metrics: tuple[Metric, ...] = ()  # in addition to those that need no setting and no extra
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,13 +131,14 @@ def build_plan(configuration: RunConfiguration, describe: Describe = environment
     metrics = (*_default_metrics(), *configuration.metrics) if task.judges_attacks else ()
     if collection.scene is None:
         metrics = tuple(metric for metric in metrics if metric.compares != "views")
+    settings = {metric: _settings(metric) for metric in metrics}  # once, since digests of large files take time
     attacks = [attack for _, attack in configuration.pairs if attack is not None]
     plugins = [*attacks, *(part for defense, _ in configuration.pairs for part in composed.list_parts(defense))]
     environment_record = dict(describe([task, extractor, *plugins, *metrics]))
     experiments = []
     for defense, attack in configuration.pairs:
         defense_record = spec.to_json_with_digests(defense, public)
-        metric_settings = {metric.name(): _settings(metric) for metric in select_metrics(metrics, defense)}
+        metric_settings = {metric.name(): settings[metric] for metric in select_metrics(metrics, defense)}
         reason = _explain_hidden_positions(task, defense) or task.explain_not_applicable(defense, attack, extractor, public)
         attack_record = _attack_record(task, defense, attack, extractor, public, reason)
         experiment_id = records.experiment_id(
@@ -180,10 +185,29 @@ def _hash_defense(defense: Defense) -> str | None:
     return files[0] if len(files) == 1 else hashing.digest(files)
 
 
+def list_extra_metrics() -> tuple[Metric, ...]:
+    """Return the metrics of the optional extras that are installed; none if the variable FEATURE_PRIVACY_EXTRA_METRICS is "none".
+
+    A configuration names them. So a plan depends on its configuration, and not on what is installed.
+
+    Raises
+    ------
+    UserError
+        if the variable has another value, or an extra is damaged.
+    """
+    value = os.environ.get(VARIABLE)
+    if value not in (None, "", NO_EXTRAS):
+        raise UserError(f"{VARIABLE}={value}: must be {NO_EXTRAS}, or not set")
+    if value == NO_EXTRAS:
+        return ()
+    candidates = [metric for metric in discovery.load_plugins(discovery.METRIC) if metric.packages]
+    return tuple(metric() for metric in candidates if all(map(environment.is_installed, metric.packages)))
+
+
 def _default_metrics() -> Iterator[Metric]:
-    """Yield all metrics that need no setting."""
+    """Yield all metrics that need no setting and no extra."""
     for metric in discovery.load_plugins(discovery.METRIC):
-        if not fields.list_required(metric):
+        if not fields.is_optional(metric):
             yield metric()
 
 

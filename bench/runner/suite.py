@@ -24,7 +24,7 @@ from bench.api import Attack, Dataset, Defense, Extractor
 from bench.core.errors import UserError, unknown_name
 from bench.extractors.sift import Sift
 from bench.images.samples import Images
-from bench.runner.plan import RunConfiguration, cross
+from bench.runner.plan import RunConfiguration, cross, list_extra_metrics
 from bench.task_api import Task
 from bench.tasks.reconstruction import Reconstruction
 
@@ -56,13 +56,14 @@ def grid(
 ) -> tuple[RunConfiguration, ...]:
     """Return every defense × attack × task, for every dataset, extractor and seed.
 
-    A task that evaluates the release itself ignores `attacks`.
+    A task that evaluates the release itself ignores `attacks`. The metrics of the installed extras are computed as well.
 
     Raises
     ------
     UserError
         if there is no defense, or no attack for a task that needs one.
     """
+    metrics = list_extra_metrics()
     return tuple(
         RunConfiguration(
             pairs=cross(task, defenses, attacks if task.judges_attacks else ()),
@@ -71,6 +72,7 @@ def grid(
             extractor=extractor,
             dataset=dataset,
             seed=seed,
+            metrics=metrics,
         )
         for task, dataset, extractor, seed in itertools.product(tasks, datasets, extractors, seeds)
     )

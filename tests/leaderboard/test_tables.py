@@ -46,6 +46,16 @@ def test_metrics_are_averaged_over_photographs() -> None:
     assert "angle" not in row  # no record has one
 
 
+def test_a_metric_of_an_extra_states_the_photographs_that_have_a_value() -> None:
+    """They are those with a face. Without them, the mean would look like that of all photographs."""
+    values = [{"ssim": 0.5, "identity": value} for value in (1.0, 0.0, None)]
+    (table,) = tables.build_tables([record(sample=str(number), metrics=each) for number, each in enumerate(values)])
+    remark = "identity: over the 2 of 3 photographs that have a value."
+    assert remark in table.remarks
+    (table,) = tables.build_tables([record(sample=str(number), metrics=each) for number, each in enumerate(values[:2])])
+    assert not any("that have a value" in other for other in table.remarks)
+
+
 def localized(sample: str, recall: float, error: float | None) -> dict[str, Any]:
     metrics = {"recall_0.25m_2deg": recall, "translation_error": error}
     return record(sample, task="localization", attack=None, metrics=metrics)

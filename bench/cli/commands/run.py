@@ -38,7 +38,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="SPEC",
-        help="a metric that needs a file; all other metrics are always computed",
+        help="a metric that needs a file or an extra; all others are computed, and those of installed extras",
     )
     add_extractor(parser)
     add_images(parser, "seven built-in ones")
@@ -57,7 +57,7 @@ def execute(args: argparse.Namespace) -> int:
     from bench.cli import watch
     from bench.registry import discovery, spec
     from bench.runner import engines
-    from bench.runner.plan import RunConfiguration, build_plan, cross
+    from bench.runner.plan import RunConfiguration, build_plan, cross, list_extra_metrics
     from bench.runner.trial import dry_run
     from leaderboard import localization_results, run_report
 
@@ -66,6 +66,8 @@ def execute(args: argparse.Namespace) -> int:
     _check_attacks(task, args.attack)
     defenses = [_read_defense(text, task) for text in args.defense]
     attacks = [spec.read(text, discovery.ATTACK) for text in args.attack or []]
+    metrics = [_read_metric(text) for text in args.metric]
+    given = {metric.name() for metric in metrics}
     configuration = RunConfiguration(
         pairs=cross(task, defenses, attacks),
         images=args.images,
@@ -73,7 +75,7 @@ def execute(args: argparse.Namespace) -> int:
         extractor=spec.read(args.extractor, discovery.EXTRACTOR),
         dataset=None if args.dataset is None else spec.read(args.dataset, discovery.DATASET),
         seed=args.seed,
-        metrics=tuple(_read_metric(text) for text in args.metric),
+        metrics=(*metrics, *(metric for metric in list_extra_metrics() if metric.name() not in given)),
     )
     plan = build_plan(configuration, engine.describe)
     dry_run(plan)
@@ -108,7 +110,7 @@ def _read_metric(text: str) -> Metric:
     from bench.registry import discovery, fields, spec
 
     metric = spec.read(text, discovery.METRIC)
-    if not fields.list_required(type(metric)):
+    if not fields.is_optional(type(metric)):
         raise UserError(f"--metric {metric.name()}: remove it; metrics that need no file are always computed")
     return metric
 
