@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from gallery_stretch import REFERENCES, STRETCH, WALK
+from gallery_stretch import list_queries, list_references
 
 from attacks.inlier import Inlier
 from bench import cli
@@ -48,13 +48,9 @@ def _cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Fifteen references and five queries between them, two of which count as night images."""
-    views = [WALK.scene().references[number] for number in STRETCH]
-    between = [image for number, image in enumerate(views) if number not in REFERENCES]
-    queries = [replace(image, condition="night" if number > 2 else "day") for number, image in enumerate(between)]
+    queries = [replace(image, condition="night" if number > 2 else "day") for number, image in enumerate(list_queries())]
     out = tmp_path_factory.mktemp("dataset") / "aachen"
-    scene_export.write(
-        Scene(name="stretch", references=tuple(views[number] for number in REFERENCES), queries=tuple(queries)), "aachen", out
-    )
+    scene_export.write(Scene(name="stretch", references=list_references(), queries=tuple(queries)), "aachen", out)
     return out
 
 
