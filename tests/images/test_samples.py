@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from fakes import draw_texture, write_scene
 
-from bench.cache import feature_cache, store
+from bench.cache import feature_cache, provenance, store
 from bench.codebook.public import Public
 from bench.core.errors import UserError
 from bench.datasets.gallery import Gallery
@@ -82,6 +82,18 @@ def test_dictionary_of_the_references_has_the_given_size(tmp_path: Path) -> None
         public.dictionary("references", 1_000_000)
     with pytest.raises(UserError, match="this task has no scene"):
         Public().dictionary("references")
+
+
+def test_another_source_of_the_extractor_is_another_index(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Otherwise the map and the dictionary in the cache would be those of features that nobody extracts any more."""
+    scene, hash_modules = write_scene(tmp_path / "scene"), provenance.hash_modules
+    digest = SceneIndex(scene, Sift()).digest
+
+    def hash_changed(*modules: str) -> str:
+        return hash_modules(*modules) + "changed" * (Sift.__module__ in modules)
+
+    monkeypatch.setattr(provenance, "hash_modules", hash_changed)
+    assert SceneIndex(scene, Sift()).digest != digest
 
 
 def test_large_dictionary_is_built_without_the_limit_on_keypoints(tmp_path: Path) -> None:
