@@ -136,7 +136,7 @@ def localize(work: Path) -> Iterator[Row]:
 
 
 def write_attacks(rows: Sequence[Row]) -> str:
-    """Write the table of attacks. A row without a score states the reason of its first record."""
+    """Write the table of attacks. A row without a score is n/a."""
     lines = [
         "## Reconstruction and identification",
         "",
