@@ -11,7 +11,7 @@ import importlib.util
 import inspect
 import platform
 from collections.abc import Iterable
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ DISTRIBUTION = "feature-privacy-bench"
 # `suites` is left out: a suite selects experiments and does not change their results.
 PACKAGES = ("attacks", "bench", "defenses", "leaderboard", "metrics")
 LIBRARIES = ("numpy", "opencv-python-headless", "pillow", "poselib", "pycolmap", "scikit-image", "torch")
+EXTRACTOR_LIBRARIES = ("kornia",)  # optional; records do not hold their versions
 
 
 def describe(plugins: Iterable[object]) -> dict[str, Any]:
@@ -46,6 +47,15 @@ def describe_platform() -> dict[str, Any]:
 def list_library_versions() -> dict[str, str]:
     """Return the versions of the libraries that results depend on."""
     return {library: version(library) for library in LIBRARIES}
+
+
+def list_extractor_library_versions() -> dict[str, str]:
+    """Return the versions of the installed libraries that features depend on, for cache keys."""
+    versions = list_library_versions()
+    for library in EXTRACTOR_LIBRARIES:
+        with contextlib.suppress(PackageNotFoundError):
+            versions[library] = version(library)
+    return versions
 
 
 def hash_source(plugins: Iterable[object]) -> str:

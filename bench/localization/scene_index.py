@@ -55,7 +55,7 @@ class SceneIndex:
         """
         source = provenance.hash_modules(mapping.__name__, covisibility.__name__)
         images = samples.hash_scene_images(self.scene.references)
-        key = [self.digest, images, source, environment.list_library_versions()]
+        key = [self.digest, images, source, environment.list_extractor_library_versions()]
         references = self.scene.references
         arrays, meta = store.fetch(maps.KIND, key, lambda: mapping.build_map(references, self.reference_features).to_arrays())
         return maps.from_arrays(arrays, meta)
@@ -95,7 +95,7 @@ class SceneIndex:
             if there are fewer descriptors than words.
         """
         size = words or WORDS
-        key = [self.digest, size, environment.list_library_versions()]
+        key = [self.digest, size, environment.list_extractor_library_versions()]
         arrays, meta = store.fetch(dictionary.KIND, key, lambda: self._cluster(size))
         return Dictionary(arrays["words"], meta, f"{self.digest}, {size} words")
 

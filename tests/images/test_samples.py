@@ -1,6 +1,7 @@
 """Samples of a scene, cached features, and the dictionary of its references."""
 
 import dataclasses
+from importlib import metadata
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ from fakes import draw_texture, write_scene
 
 from bench.cache import feature_cache, provenance, store
 from bench.codebook.public import Public
+from bench.core import environment
 from bench.core.errors import UserError
 from bench.datasets.gallery import Gallery
 from bench.extractors.sift import Sift
@@ -53,7 +55,9 @@ class Counted(Pixels):
         return np.array(draw_texture(self.seed))
 
 
-def test_features_are_cached_by_content_and_computed_again_if_damaged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_features_are_cached_by_content_and_computed_again_if_damaged(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
     image, extractor = Counted(1), Sift()
     first = feature_cache.extract(extractor, image)
     assert are_equal(first, extractor.extract(np.array(draw_texture(1))))
@@ -67,6 +71,9 @@ def test_features_are_cached_by_content_and_computed_again_if_damaged(tmp_path: 
     assert are_equal(first, feature_cache.extract(extractor, image))
     assert image.reads == 3
     assert "computed again" in caplog.text
+    monkeypatch.setattr(environment, "version", lambda library: "0.0" if library == "kornia" else metadata.version(library))
+    feature_cache.extract(extractor, image)
+    assert image.reads == 4  # another version of the library of the learned extractors
 
 
 def test_dictionary_of_the_references_has_the_given_size(tmp_path: Path) -> None:
