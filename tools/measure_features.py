@@ -18,8 +18,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from measure_geometry import RECALLS, list_values
-from result_page import format_interval, write_page
+from result_page import RECALLS, SMALL_GALLERY, format_interval, list_values, write_page
 
 import bench
 from bench.api import Defense, Extractor
@@ -50,7 +49,6 @@ DEFENSES = ("none", "affine:dim=4", "ldp:epsilon=12", "ldp:epsilon=10", "ldp:eps
 ATTACKS = ("dia", "keypoints", "blank")
 FIELDS = {"affine": "database", "ldp": "dictionary"}  # of the words
 SHOWN = {"ssim": 3, "psnr": 2, "identified": 3}  # metric -> digits
-SCENE = "gallery:views=40,queries=12,rooms=2"
 LOCALIZED = ("none", "affine:dim=4", "ldp:epsilon=12", "ldp:epsilon=10")
 
 
@@ -129,14 +127,14 @@ def localize(work: Path) -> Iterator[Row]:
                 [defense],
                 extractor=spec.read(name, discovery.EXTRACTOR),
                 task=spec.read("localization", discovery.TASK),
-                dataset=spec.read(SCENE, discovery.DATASET),
+                dataset=spec.read(SMALL_GALLERY, discovery.DATASET),
                 out=work,
             )
             yield Row(name, text, "", find_true_word_chance(defense), records)
 
 
 def write_attacks(rows: Sequence[Row]) -> str:
-    """Write the table of attacks. A row without a score states the reason of its first record."""
+    """Write the table of attacks. A row without a score is n/a."""
     lines = [
         "## Reconstruction and identification",
         "",
@@ -159,8 +157,8 @@ def write_localization(rows: Sequence[Row]) -> str:
     lines = [
         "## Localization",
         "",
-        f"Dataset `{SCENE}`, at most 1,000 keypoints an image. A small scene, so differences of a few queries mean nothing. "
-        "Fraction of queries within the thresholds.",
+        f"Dataset `{SMALL_GALLERY}`, at most 1,000 keypoints an image. A small scene, so differences of a few queries mean "
+        "nothing. Fraction of queries within the thresholds.",
         "",
         markdown_row(("features", "defense", "true word", "queries", *RECALLS.values(), "matches")),
         markdown_row(["---"] * 8),

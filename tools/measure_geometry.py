@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from result_page import format_interval, write_page
+from result_page import RECALLS, SMALL_GALLERY, format_interval, list_values, write_page
 
 import bench
 from bench.core.table import markdown_row
@@ -37,9 +37,7 @@ ON_HIDDEN = ("neighbourhood-oracle", "neighbourhood", "density", "blank")
 COMPOSED = ("lines+ldp:epsilon=16", "lines+ldp:epsilon=10")
 ON_COMPOSED = ("neighbourhood-oracle", "neighbourhood")
 SHOWN = {"position-error": 1, "ssim": 3, "psnr": 2, "identified": 3}  # metric -> digits
-SCENE = "gallery:views=40,queries=12,rooms=2"
 LOCALIZED = ("none", "lines", "permutation")
-RECALLS = {"recall_0.25m_2deg": "0.25 m, 2°", "recall_0.5m_5deg": "0.5 m, 5°", "recall_5m_10deg": "5 m, 10°"}
 
 
 def main() -> None:
@@ -71,7 +69,7 @@ def localize(defense: str, work: Path) -> list[Record]:
     return bench.run(
         [spec.read(defense, discovery.DEFENSE)],
         task=spec.read("localization", discovery.TASK),
-        dataset=spec.read(SCENE, discovery.DATASET),
+        dataset=spec.read(SMALL_GALLERY, discovery.DATASET),
         out=work,
     )
 
@@ -103,7 +101,7 @@ def write_localization(results: Mapping[str, Sequence[Record]]) -> str:
     lines = [
         "## Localization",
         "",
-        f"Dataset `{SCENE}`, a rendered building. A difference of one or two of its queries is no evidence.",
+        f"Dataset `{SMALL_GALLERY}`, a rendered building. A difference of one or two of its queries is no evidence.",
         "A query is *localized* if a pose was found. Columns with thresholds: fractions of all queries. Errors: medians over",
         "the localized ones. *matches* and *trials* (of RANSAC; 0 without a pose) are medians over all queries.",
         "",
@@ -119,11 +117,6 @@ def write_localization(results: Mapping[str, Sequence[Record]]) -> str:
         counts = [f"{np.median(list_values(records, metric)):.0f}" for metric in ("matches", "trials")]
         lines.append(markdown_row((f"`{defense}`", len(records), len(errors[0]), *recalls, *medians, *counts)))
     return "\n".join([*lines, ""])
-
-
-def list_values(records: Sequence[Record], metric: str) -> np.ndarray:
-    """List the values of a metric. -> (samples,), without samples that have none"""
-    return np.array([value for record in records if (value := record["metrics"].get(metric)) is not None])
 
 
 if __name__ == "__main__":

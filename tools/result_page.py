@@ -1,21 +1,26 @@
-"""Shared by the tools that write pages in docs/results/: a cache of each sample's results, intervals as text, and provenance."""
+"""Shared by the tools that write pages in docs/results/: a cache of results, values and intervals as text, and provenance."""
 
 from __future__ import annotations
 
 import itertools
 import shlex
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from bench.cache import provenance, store
 from bench.core import environment
 from bench.formats.tensor_file import Arrays
+from bench.runner.records import Record
 from leaderboard.intervals import Interval
 from leaderboard.provenance import format_provenance
 
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
+SMALL_GALLERY = "gallery:views=40,queries=12,rooms=2"  # a dataset for localization
+RECALLS = {"recall_0.25m_2deg": "0.25 m, 2°", "recall_0.5m_5deg": "0.5 m, 5°", "recall_5m_10deg": "5 m, 10°"}
 PLACEHOLDERS = {"--data": "DATA", "--work": "WORK"}  # option -> text for its value, a local folder
 
 
@@ -34,6 +39,11 @@ def cache_arrays(tool: str, inputs: Any, compute: Callable[[], Arrays]) -> Array
 def format_interval(value: Interval, digits: int, sign: str = "") -> str:
     """Return the mean and the ends of an interval. `sign` "+" shows the sign of positive numbers."""
     return f"{value.mean:{sign}.{digits}f} [{value.low:{sign}.{digits}f}, {value.high:{sign}.{digits}f}]"
+
+
+def list_values(records: Sequence[Record], metric: str) -> np.ndarray:
+    """List the values of a metric. -> (samples,), without samples that have none"""
+    return np.array([value for record in records if (value := record["metrics"].get(metric)) is not None])
 
 
 def write_page(name: str, text: str, configurations: Iterable[Mapping[str, Any]]) -> None:

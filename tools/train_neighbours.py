@@ -94,10 +94,10 @@ def fit(secrets: list[Features], steps: int) -> Model:
             points = torch.from_numpy(secret.keypoints)
             near = ((points[:, None] - points[None]).norm(dim=2) < NEAR).float()
             mask = 1 - torch.eye(len(points))
-            rate = (near * mask).sum() / mask.sum()
+            rate = ((near * mask).sum() / mask.sum()).clamp(1e-4, 1 - 1e-4)  # a photograph may have no neighbours
             noise = rng.uniform(0, NOISE) * rng.integers(2) * rng.normal(size=secret.descriptors.shape) / 128**0.5
             descriptors = nnf.normalize(torch.from_numpy((secret.descriptors + noise).clip(0).astype(np.float32)), dim=1)
-            logits = module(descriptors) + torch.logit(rate.clamp(1e-4, 1 - 1e-4))
+            logits = module(descriptors) + torch.logit(rate)
             loss = nnf.binary_cross_entropy_with_logits(logits, near, mask, reduction="sum") / mask.sum()
             losses.append(loss / (-(rate * rate.log() + (1 - rate) * (1 - rate).log())))  # relative to knowing the rate alone
         value = torch.stack(losses).mean()

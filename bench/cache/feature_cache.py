@@ -85,7 +85,7 @@ def _key(extractor: Extractor, pixels: Pixels) -> dict[str, Any]:
         **({} if file is None else {"name": file.name}),
         "extractor": spec.to_json(extractor),
         "source": provenance.hash_modules(type(extractor).__module__),
-        "libraries": environment.list_library_versions(),
+        "libraries": environment.list_extractor_library_versions(),
     }
 
 

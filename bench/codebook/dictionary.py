@@ -77,7 +77,7 @@ class Dictionary:
         Raises
         ------
         UserError
-            if the lengths differ, or the descriptors have negative components and the words have 8 bits.
+            if the lengths differ, or one of the two has signs and the other the 8 bits of SIFT.
         """
         hint = "build one for this extractor with `bench dictionary build`"
         if rows.shape[1] != self.words.shape[1]:
@@ -85,6 +85,8 @@ class Dictionary:
         negative = np.square(np.minimum(rows, 0, dtype=np.float64)).sum()  # of learned features about half of the total
         if self.words.dtype == np.uint8 and negative > MAX_NEGATIVE * np.square(rows, dtype=np.float64).sum():
             raise UserError(f"the descriptors have negative components, the words of {asset} are 8-bit vectors of SIFT; {hint}")
+        if rows.dtype == np.uint8 and self.words.dtype == np.int8:
+            raise UserError(f"the descriptors are 8-bit vectors of SIFT, the words of {asset} have signs; {hint}")
 
     def sub_database(self, index: int, count: int) -> Words:
         """Return the rows of sub-database `index` of `count`, by the rule at the top of this file."""

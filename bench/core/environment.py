@@ -19,6 +19,7 @@ DISTRIBUTION = "feature-privacy-bench"
 # `suites` is left out: a suite selects experiments and does not change their results.
 PACKAGES = ("attacks", "bench", "defenses", "leaderboard", "metrics")
 LIBRARIES = ("numpy", "opencv-python-headless", "pillow", "poselib", "pycolmap", "scikit-image", "torch")
+EXTRACTOR_LIBRARIES = ("kornia",)  # optional; records do not hold their versions
 
 
 def describe(plugins: Iterable[object]) -> dict[str, Any]:
@@ -55,6 +56,12 @@ def is_installed(distribution: str) -> bool:
     except PackageNotFoundError:
         return False
     return True
+
+
+def list_extractor_library_versions() -> dict[str, str]:
+    """Return the versions of the installed libraries that features depend on, for cache keys."""
+    installed = (library for library in EXTRACTOR_LIBRARIES if is_installed(library))
+    return list_library_versions() | {library: version(library) for library in installed}
 
 
 def hash_source(plugins: Iterable[object]) -> str:

@@ -45,12 +45,16 @@ def estimate(lines: Doubles, xyz: Doubles, camera: pycolmap.Camera, *, trials: i
     # PoseLib's solver turns its equations by the C library's random numbers.
     ctypes.CDLL(None).srand(seed % 2**31)
     normals, scales = _find_planes(lines, camera)
+    usable = np.isfinite(scales)  # the lens model need not reach as far as a line does
+    if usable.sum() < MIN_LINES:
+        return None
+    normals, scales, points = normals[usable], scales[usable], xyz[usable]
     rng, best, most, needed, done = np.random.default_rng(seed), None, 0.0, math.inf, 0
     while done < min(trials, max(needed, MIN_TRIALS)):
         batch = min(BATCH, trials - done)
         done += batch
-        poses = _solve(normals, xyz, batch, rng)
-        scores = _score(poses, normals, scales, xyz)  # (P,)
+        poses = _solve(normals, points, batch, rng)
+        scores = _score(poses, normals, scales, points)  # (P,)
         if len(poses) == 0 or scores.max() <= most:
             continue
         refined = _refine(poses[scores.argmax()], lines, xyz, camera)
@@ -89,7 +93,8 @@ def _project(pose: Doubles, camera: pycolmap.Camera, xyz: Doubles) -> Doubles:
 def _find_planes(lines: Doubles, camera: pycolmap.Camera) -> tuple[Doubles, Doubles]:
     """Return the unit normal of the plane through camera and line, and the pixels per unit of the line's equation.
 
-    Under lens distortion the plane passes through two points of the line, a quarter of the image from its middle. -> (C, 3), (C,)
+    Under lens distortion the plane passes through two points of the line, a quarter of the image from its middle.
+    Both are NaN if the lens model does not reach these points. -> (C, 3), (C,)
     """
     normal, middle = lines[:, :2], np.array([camera.width, camera.height]) / 2
     foot = middle - (normal @ middle + lines[:, 2])[:, None] * normal  # (C, 2) of the line, nearest to the middle

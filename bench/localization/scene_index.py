@@ -11,7 +11,7 @@ from bench.api import Extractor
 from bench.cache import feature_cache, provenance, store
 from bench.codebook import build, dictionary
 from bench.codebook.dictionary import Dictionary
-from bench.core import hashing
+from bench.core import environment, hashing
 from bench.core.errors import UserError
 from bench.images import samples
 from bench.images.scene import Scene
@@ -39,7 +39,8 @@ class SceneIndex:
     def digest(self) -> str:
         """Digest of everything that determines the dictionary, except its number of words."""
         hashes = [image.pixels.content_hash() for image in self.scene.references]
-        return hashing.digest(["references", hashes, spec.to_json(self.extractor), SEED, provenance.hash_modules(build.__name__)])
+        source = provenance.hash_modules(build.__name__, type(self.extractor).__module__)
+        return hashing.digest(["references", hashes, spec.to_json(self.extractor), SEED, source])
 
     @cached_property
     def map(self) -> Map:
@@ -53,7 +54,8 @@ class SceneIndex:
             if no point could be triangulated.
         """
         source = provenance.hash_modules(mapping.__name__, covisibility.__name__)
-        key = [self.digest, samples.hash_scene_images(self.scene.references), source]
+        images = samples.hash_scene_images(self.scene.references)
+        key = [self.digest, images, source, environment.list_extractor_library_versions()]
         references = self.scene.references
         arrays, meta = store.fetch(maps.KIND, key, lambda: mapping.build_map(references, self.reference_features).to_arrays())
         return maps.from_arrays(arrays, meta)
@@ -93,7 +95,8 @@ class SceneIndex:
             if there are fewer descriptors than words.
         """
         size = words or WORDS
-        arrays, meta = store.fetch(dictionary.KIND, [self.digest, size], lambda: self._cluster(size))
+        key = [self.digest, size, environment.list_extractor_library_versions()]
+        arrays, meta = store.fetch(dictionary.KIND, key, lambda: self._cluster(size))
         return Dictionary(arrays["words"], meta, f"{self.digest}, {size} words")
 
     def _cluster(self, size: int) -> store.Content:

@@ -43,7 +43,9 @@ def protect(features: Features, defense: Defense, public: Public | None = None, 
         raise UserError(f"{defense.name()}, as configured, is not memoized; omit device=, because a key would repeat the draws")
     key = secrets.token_bytes(KEY_BYTES) if device is None else _derive_key(_load_device_key(Path(device)), defense, public)
     rng = create_generator(key)
-    return defense.protect(hide_order(features, defense, rng), public, rng)
+    # The number of draws for an order varies: from the device's generator, they would change a memoized defense's answers.
+    order = rng if device is None else create_generator(secrets.token_bytes(KEY_BYTES))
+    return defense.protect(hide_order(features, defense, order), public, rng)
 
 
 def hide_order(secret: Features, defense: Defense, rng: np.random.Generator) -> Features:

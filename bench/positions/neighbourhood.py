@@ -42,8 +42,12 @@ def recover_positions(
     weights : (N, k) at least 0; 0 leaves a neighbour out
     reach : pixels; a line farther away than this costs no more than one at this distance
     known : (N, 2) positions of some neighbours, NaN for the others; the nearest point to a known position replaces the crossing
+
+    Without neighbours, the estimate is the point nearest to the centre of the image.
     """
     clipped = clip_lines(lines, size)
+    if neighbours.shape[1] == 0:  # a single keypoint
+        return clipped.locate(np.clip(0.0, clipped.first, clipped.last))
     best = np.empty(len(lines))
     for start in range(0, len(lines), BLOCK):
         rows = slice(start, start + BLOCK)

@@ -31,6 +31,9 @@ def parse(text: str, kind: Kind[P]) -> tuple[type[P], dict[str, Any]]:
         if the name or a field is misspelt, or a value has the wrong type.
     """
     name, _, rest = text.partition(":")
+    if kind is discovery.DEFENSE and "+" in name:  # `split_parts` leaves a `+` beside a misspelt name
+        for part in name.split("+"):
+            discovery.load_plugin(kind, part.strip())
     plugin = discovery.load_plugin(kind, name.strip())
     types = fields.resolve_types(plugin)
     given: dict[str, Any] = {}

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from gallery_stretch import REFERENCES, STRETCH, WALK
+from gallery_stretch import list_queries, list_references
 
 from attacks.inlier import Inlier
 from bench.api import View
@@ -25,14 +25,12 @@ SIFT = Sift(max_keypoints=400)
 
 @pytest.fixture(scope="module")
 def scene_index() -> SceneIndex:
-    images = [WALK.scene().references[number] for number in STRETCH]
-    references = tuple(images[number] for number in REFERENCES)
-    return SceneIndex(Scene(name="stretch", references=references, queries=()), SIFT)
+    return SceneIndex(Scene(name="stretch", references=list_references(), queries=()), SIFT)
 
 
 @pytest.fixture(scope="module")
 def query() -> Sample:
-    image = WALK.scene().references[STRETCH[2]]
+    image = list_queries()[0]
     return Sample(name=image.name, images=(image.pixels,), subject=image)
 
 

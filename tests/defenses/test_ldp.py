@@ -19,6 +19,7 @@ from scipy import stats
 
 from bench.api import Privacy
 from bench.codebook import dictionary
+from bench.codebook.examples import draw_features, write_dictionary
 from bench.codebook.public import Public
 from bench.core.errors import UserError
 from bench.core.exact import Exact, to_fraction
@@ -589,6 +590,10 @@ def test_unsuitable_dictionaries(tmp_path: Path) -> None:
     )
     with pytest.raises(UserError, match=r"descriptors have length 256, the words of .* 128"):
         LDP(dictionary=make_dictionary(tmp_path, 3)).protect(longer, Public(), np.random.default_rng(0))
+    signed = LDP(dictionary=write_dictionary(tmp_path, signed=True))
+    with pytest.raises(UserError, match=r"8-bit vectors of SIFT, the words of .* have signs"):
+        signed.protect(draw_features(), Public(), np.random.default_rng(0))
+    signed.protect(draw_features(signed=True), Public(), np.random.default_rng(0))
     with pytest.raises(UserError, match="no such file"):
         LDP(dictionary=Asset(tmp_path / "missing")).privacy(Public())
 

@@ -4,7 +4,7 @@ import dataclasses
 import shutil
 import socket
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -38,6 +38,7 @@ ALL: list[tuple[type[Extractor], dict[str, Any]]] = [
 EVERY = pytest.mark.parametrize(("plugin", "given"), ALL, ids=[" ".join([p.name(), *g.values()]) for p, g in ALL])
 # One photograph in `make test`, all three in `make test-exhaustive`.
 NUMBERS = pytest.mark.parametrize("number", [0, *(pytest.param(number, marks=pytest.mark.exhaustive) for number in (1, 2))])
+TOGETHER = pytest.mark.parametrize("numbers", [(0,), pytest.param((0, 1, 2), marks=pytest.mark.exhaustive)], ids=["one", "all"])
 
 
 def build(plugin: type[Extractor], given: dict[str, Any]) -> Any:
@@ -126,10 +127,10 @@ def test_other_weights_give_other_descriptors(tmp_path: Path) -> None:
 # ---- keypoints
 
 
-def measure_shift(plugin: type[Extractor], given: dict[str, Any], change: Callable, undo: Callable) -> Floats:
+def measure_shift(extractor: Extractor, numbers: Sequence[int], change: Callable, undo: Callable) -> Floats:
     """Return the median displacement of keypoints that are found again in changed photographs. -> (2,) pixels"""
-    extractor, shifts = build(plugin, given), []
-    for number in range(3):
+    shifts = []
+    for number in numbers:
         first = extractor.extract(read(number)).keypoints
         second = undo(extractor.extract(np.ascontiguousarray(change(read(number)))).keypoints)
         distances, same = KDTree(first).query(second)
@@ -139,29 +140,34 @@ def measure_shift(plugin: type[Extractor], given: dict[str, Any], change: Callab
 
 @pytest.mark.slow
 @pytest.mark.parametrize("plugin", [XFeat, pytest.param(Disk, marks=pytest.mark.exhaustive)])
-def test_pixels_of_the_mirrored_photograph(plugin: type[Extractor]) -> None:
+@TOGETHER
+def test_pixels_of_the_mirrored_photograph(numbers: Sequence[int], plugin: type[Extractor]) -> None:
     """Whole pixels: if the first centre was at (0, 0), keypoints of the mirrored photograph would be off by one."""
-    assert measure_shift(plugin, {}, lambda image: image[:, ::-1], lambda xy: (256, 0) + xy * (-1, 1)) == pytest.approx(
-        0, abs=1e-3
-    )
-    assert measure_shift(plugin, {}, lambda image: image[::-1], lambda xy: (0, 256) + xy * (1, -1)) == pytest.approx(0, abs=1e-3)
+    extractor = build(plugin, {})
+    across = measure_shift(extractor, numbers, lambda image: image[:, ::-1], lambda xy: (256, 0) + xy * (-1, 1))
+    down = measure_shift(extractor, numbers, lambda image: image[::-1], lambda xy: (0, 256) + xy * (1, -1))
+    assert (*across, *down) == pytest.approx(4 * (0,), abs=1e-3)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("variant", ["t16", *(pytest.param(name, marks=pytest.mark.exhaustive) for name in ("n16", "n32"))])
-def test_positions_in_the_enlarged_photograph(variant: str) -> None:
+@TOGETHER
+def test_positions_in_the_enlarged_photograph(numbers: Sequence[int], variant: str) -> None:
     """Twice the size doubles positions from the corner: if the first centre was at (0, 0), they would be off by a quarter."""
-    shift = measure_shift(Aliked, {"variant": variant}, lambda image: cv2.resize(image, (512, 512)), lambda xy: xy / 2)
+    extractor = build(Aliked, {"variant": variant})
+    shift = measure_shift(extractor, numbers, lambda image: cv2.resize(image, (512, 512)), lambda xy: xy / 2)
     assert np.abs(shift).max() < 0.125
 
 
 @pytest.mark.slow
 @EVERY
-def test_positions_in_the_cropped_photograph(plugin: type[Extractor], given: dict[str, Any]) -> None:
-    shift = measure_shift(plugin, given, lambda image: image[64:, 32:], lambda xy: xy + np.array([32, 64]))
+@TOGETHER
+def test_positions_in_the_cropped_photograph(numbers: Sequence[int], plugin: type[Extractor], given: dict[str, Any]) -> None:
+    shift = measure_shift(build(plugin, given), numbers, lambda image: image[64:, 32:], lambda xy: xy + np.array([32, 64]))
     assert np.abs(shift).max() < 0.05
 
 
+@pytest.mark.slow
 @EVERY
 def test_the_strongest_keypoints_are_selected(plugin: type[Extractor], given: dict[str, Any]) -> None:
     extractor = build(plugin, given)

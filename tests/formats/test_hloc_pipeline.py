@@ -6,14 +6,14 @@ layout are read, mutual nearest neighbours matched, points triangulated from the
 
 import importlib.util
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pycolmap
 import pytest
-from gallery_stretch import REFERENCES, STRETCH, WALK
+from gallery_stretch import list_queries, list_references
 from scipy.stats import fisher_exact
 
 from bench import cli
@@ -65,9 +65,7 @@ def export_scene(scene: Scene, folder: Path, keypoints: int) -> Export:
 @pytest.fixture(scope="module")
 def stretch(tmp_path_factory: pytest.TempPathFactory) -> Export:
     """Fifteen references and five queries between them."""
-    views = [WALK.scene().references[number] for number in STRETCH]
-    queries = tuple(replace(image) for number, image in enumerate(views) if number not in REFERENCES)
-    scene = Scene(name="stretch", references=tuple(views[number] for number in REFERENCES), queries=queries)
+    scene = Scene(name="stretch", references=list_references(), queries=list_queries())
     return export_scene(scene, tmp_path_factory.mktemp("stretch"), 400)
 
 

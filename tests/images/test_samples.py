@@ -1,14 +1,16 @@
 """Samples of a scene, cached features, and the dictionary of its references."""
 
 import dataclasses
+from importlib import metadata
 from pathlib import Path
 
 import numpy as np
 import pytest
 from fakes import draw_texture, write_scene
 
-from bench.cache import feature_cache, store
+from bench.cache import feature_cache, provenance, store
 from bench.codebook.public import Public
+from bench.core import environment
 from bench.core.errors import UserError
 from bench.datasets.gallery import Gallery
 from bench.extractors.sift import Sift
@@ -53,7 +55,9 @@ class Counted(Pixels):
         return np.array(draw_texture(self.seed))
 
 
-def test_features_are_cached_by_content_and_computed_again_if_damaged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_features_are_cached_by_content_and_computed_again_if_damaged(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
     image, extractor = Counted(1), Sift()
     first = feature_cache.extract(extractor, image)
     assert are_equal(first, extractor.extract(np.array(draw_texture(1))))
@@ -67,6 +71,9 @@ def test_features_are_cached_by_content_and_computed_again_if_damaged(tmp_path: 
     assert are_equal(first, feature_cache.extract(extractor, image))
     assert image.reads == 3
     assert "computed again" in caplog.text
+    monkeypatch.setattr(environment, "version", lambda library: "0.0" if library == "kornia" else metadata.version(library))
+    feature_cache.extract(extractor, image)
+    assert image.reads == 4  # another version of the library of the learned extractors
 
 
 def test_dictionary_of_the_references_has_the_given_size(tmp_path: Path) -> None:
@@ -82,6 +89,18 @@ def test_dictionary_of_the_references_has_the_given_size(tmp_path: Path) -> None
         public.dictionary("references", 1_000_000)
     with pytest.raises(UserError, match="this task has no scene"):
         Public().dictionary("references")
+
+
+def test_another_source_of_the_extractor_is_another_index(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Otherwise the map and the dictionary in the cache would be those of features that nobody extracts any more."""
+    scene, hash_modules = write_scene(tmp_path / "scene"), provenance.hash_modules
+    digest = SceneIndex(scene, Sift()).digest
+
+    def hash_changed(*modules: str) -> str:
+        return hash_modules(*modules) + "changed" * (Sift.__module__ in modules)
+
+    monkeypatch.setattr(provenance, "hash_modules", hash_changed)
+    assert SceneIndex(scene, Sift()).digest != digest
 
 
 def test_large_dictionary_is_built_without_the_limit_on_keypoints(tmp_path: Path) -> None:

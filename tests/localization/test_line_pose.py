@@ -40,6 +40,22 @@ def test_exact_lines_give_the_exact_pose(rng: np.random.Generator, model: str) -
     np.testing.assert_allclose(pose.compute_errors(result.cam_from_world, truth), 0, atol=1e-5)
 
 
+def test_a_line_beyond_the_lens_model_does_not_hide_the_others(rng: np.random.Generator) -> None:
+    """Barrel distortion has a greatest radius. A line across a corner extends to pixels that have no ray."""
+    _, _, camera, truth = problem(rng, 1, 0, model="SIMPLE_RADIAL")
+    camera.params = [*camera.params[:3], -0.25]
+    xy = np.concatenate([[[632, 474]], rng.uniform(0.1, 0.9, (159, 2)) * SIZE])
+    xyz = truth.inverse() * (np.column_stack([camera.cam_from_img(xy), np.ones(160)]) * rng.uniform(2, 8, (160, 1)))
+    xyz[60:] = xyz[60:][rng.permutation(100)]
+    lines = draw_lines(rng, xy)
+    lines[0] = 0.8, 0.6, -xy[0] @ (0.8, 0.6)
+    assert np.flatnonzero(np.isnan(line_pose._find_planes(lines, camera)[1])).tolist() == [0]
+    result = line_pose.estimate(lines, xyz, camera, trials=TRIALS, seed=0)
+    assert result is not None
+    assert result.inliers[:60].all()
+    np.testing.assert_allclose(pose.compute_errors(result.cam_from_world, truth), 0, atol=0.1)
+
+
 def test_true_lines_are_found_among_wrong_ones(rng: np.random.Generator) -> None:
     lines, xyz, camera, truth = problem(rng, 100, 60, noise=0.5)
     result = line_pose.estimate(lines, xyz, camera, trials=TRIALS, seed=0)

@@ -4,12 +4,11 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from gallery_stretch import QUERY, REFERENCES, STRETCH, WALK, WORDS
+from gallery_stretch import QUERY, REFERENCES, STRETCH, WORDS, list_images, render_view
 
 from bench.codebook.build import cluster
 from bench.codebook.examples import draw_features
 from bench.core.errors import UserError
-from bench.datasets.gallery import render
 from bench.extractors.sift import Sift
 from bench.geometry.nearest_words import WordIndex, unit_rows
 from bench.images.scene import Reference
@@ -29,7 +28,7 @@ Views = tuple[list[Reference], list[Features]]
 
 @pytest.fixture(scope="module")
 def stretch() -> Views:
-    images = [WALK.scene().references[number] for number in STRETCH]
+    images = list(list_images())
     return images, [Sift(max_keypoints=400).extract(image.pixels.read()) for image in images]
 
 
@@ -59,7 +58,7 @@ def test_points_lie_where_they_were_rendered(scene_map: Map, references: Views) 
         keypoints, xyz = scene_map.keypoints[rows][has_point], scene_map.xyz[scene_map.points[rows][has_point]]
         assert np.median(pose.compute_reprojection_errors(image.cam_from_world, image.camera, keypoints, xyz)) < 1
         x, y = np.floor(keypoints).astype(int).T
-        view = render(WALK, "reference", STRETCH[REFERENCES[number]])
+        view = render_view(STRETCH[REFERENCES[number]])
         depths = view.depth[y, x]
         off.append(np.abs((image.cam_from_world * xyz)[:, 2] / depths - 1))
         foreground.append(view.foreground[y, x])

@@ -12,10 +12,12 @@ from bench.codebook.examples import draw_features
 from bench.codebook.public import Public
 from bench.core.errors import UserError
 from bench.mechanisms import protection
+from bench.registry.composed import Composed
 from bench.settings import Asset
 from bench.testing import are_equal
 from bench.types import Descriptors, WordSets
 from defenses.ldp import LDP
+from defenses.lines import RandomLines
 from defenses.none import Undefended
 
 
@@ -113,3 +115,12 @@ def test_missing_and_invalid_keys_are_refused(small: Asset, tmp_path: Path) -> N
         bench.protect(features, memoized, device=tmp_path / "short")
     with pytest.raises(UserError, match="cannot create or read the device's key: No such file"):
         bench.protect(features, memoized, device=tmp_path / "nowhere" / "key")
+
+
+def test_a_memoized_defense_that_hides_positions_answers_all_photographs_alike(small: Asset, tmp_path: Path) -> None:
+    """Photographs have different numbers of keypoints, and so different draws of an order."""
+    ldp = LDP(dictionary=small, epsilon=3.0, subset_size=2, memoize=True)
+    defense, features = Composed(geometry=RandomLines(), descriptors=ldp), draw_features(50)
+    releases = [bench.protect(features.take(np.arange(count)), defense, device=tmp_path / "key") for count in (50, 20)]
+    every, some = ({tuple(sorted(row)) for row in words(release).tolist()} for release in releases)
+    assert some < every

@@ -78,3 +78,9 @@ def test_a_neighbour_at_a_known_position_gives_the_nearest_point(rng: np.random.
     neighbours = np.array([[1, 2, 3]] * 6)
     position = recover_positions(lines, neighbours, np.ones((6, 3)), SIZE, known=known)[0]
     np.testing.assert_allclose(position, xy[0], atol=1e-3)
+
+
+def test_a_single_keypoint_is_estimated_near_the_centre() -> None:
+    lines = np.array([[0.6, 0.8, -130.0]])  # 22 pixels from the centre
+    position = recover_positions(lines, np.empty((1, 0), np.int64), np.empty((1, 0), np.float32), SIZE)
+    np.testing.assert_allclose(position, np.array([[100, 60]]) + 22 * lines[:, :2], atol=1e-4)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from gallery_stretch import REFERENCES, STRETCH, WALK
+from gallery_stretch import list_queries, list_references
 
 from attacks.inlier import Inlier
 from bench import cli
@@ -48,13 +48,9 @@ def _cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Fifteen references and five queries between them, two of which count as night images."""
-    views = [WALK.scene().references[number] for number in STRETCH]
-    between = [image for number, image in enumerate(views) if number not in REFERENCES]
-    queries = [replace(image, condition="night" if number > 2 else "day") for number, image in enumerate(between)]
+    queries = [replace(image, condition="night" if number > 2 else "day") for number, image in enumerate(list_queries())]
     out = tmp_path_factory.mktemp("dataset") / "aachen"
-    scene_export.write(
-        Scene(name="stretch", references=tuple(views[number] for number in REFERENCES), queries=tuple(queries)), "aachen", out
-    )
+    scene_export.write(Scene(name="stretch", references=list_references(), queries=tuple(queries)), "aachen", out)
     return out
 
 
@@ -143,13 +139,16 @@ def _retrieved(record: Record) -> list[str]:
 def test_the_inlier_attack_verifies_what_the_server_can_localize(dataset: Path) -> None:
     """Subspaces are matched with all references, because retrieval by them fails; random words verify almost nothing."""
     random = LDP(dictionary=Asset("references"), words=1000, epsilon=0.0)
-    found = execute.run([Undefended(), Affine(), random], [Inlier(retrieved=1, trials=3000)], dataset=Aachen(path=dataset))
+    found = execute.run(
+        [Undefended(), Affine(), random], [Inlier(retrieved=1, trials=3000)], dataset=Aachen(path=dataset), extractor=SIFT
+    )
     inliers: dict[str, list[int]] = {}
     for record in found:
-        inliers.setdefault(record["defense"]["name"], []).append(int(record["notes"][-1].split()[0]))
-    assert min(inliers["none"]) > 100
+        (note,) = (note for note in record["notes"] if note.endswith("keypoints verified"))
+        inliers.setdefault(record["defense"]["name"], []).append(int(note.split()[0]))
+    assert min(inliers["none"]) > 50
     assert np.mean(inliers["affine"]) > np.mean(inliers["none"])  # of one reference's points
-    # The digest of our source enters the seed of this release. Over eight seeds the greatest number was 16 to 24.
+    # The digest of our source enters the seed of this release. Over eight seeds, and with more keypoints, at most 24.
     assert max(inliers["ldp"]) < 30
 
 
