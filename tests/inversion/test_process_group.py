@@ -40,8 +40,9 @@ def run_half(rank, folder, jointly):
     distributed.destroy_process_group()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("jointly", [True, False])
+@pytest.mark.parametrize(
+    "jointly", [pytest.param(True, marks=pytest.mark.slow), pytest.param(False, marks=pytest.mark.exhaustive)]
+)
 def test_batch_norm_is_over_the_batch_of_both_processes(jointly, tmp_path):
     """PyTorch's batch norm over the part of each process differs (negative control)."""
     torch.manual_seed(0)

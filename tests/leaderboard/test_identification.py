@@ -131,7 +131,7 @@ def test_a_random_guess_gains_less_than_the_stated_bias(count: int) -> None:
     assert 0 < np.mean(gains) < summarize_identification([1.0] * count).bias == pytest.approx(1 / (count * math.log(2)))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_bias_of_a_fit_within_the_family_is_the_stated_one() -> None:
     truth, count = compute_power_law(1.0, 0.2), 100
     gains = [measure_bits(1 / ranks).mean for ranks in draw_ranks(truth, count, 600, 3)]

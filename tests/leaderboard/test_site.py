@@ -437,8 +437,7 @@ def test_on_a_phone_nothing_runs_over_the_side(phone: Any) -> None:
     assert fits()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("width", [1420, 390])
+@pytest.mark.parametrize("width", [pytest.param(1420, marks=pytest.mark.slow), pytest.param(390, marks=pytest.mark.exhaustive)])
 def test_identification_is_beside_ssim_and_in_sight(browser: Any, tmp_path: Path, width: int) -> None:
     records = [*reconstructions(ldp(4.0), [0.4, 0.5, 0.3] * 2), *baselines(NONE, 6)]
     for record, value in zip(records, [1.0, 1.0, 0.25, 1.0, 1 / 30, 0.5, *[1 / 128.5] * 12], strict=True):

@@ -70,8 +70,18 @@ if __name__ == "__main__":
 
 @pytest.mark.parametrize(
     ("script", "count"),
-    [(WORKERS, 2), (ATTACK, 1), (EXTRACTION, 2), (TRAINING, 2), (DASK, 2)],
-    ids=["workers", "attack process", "extraction", "training", "dask"],
+    [
+        pytest.param(WORKERS, 2, id="workers"),
+        *(
+            pytest.param(script, count, id=name, marks=pytest.mark.exhaustive)
+            for script, count, name in (
+                (ATTACK, 1, "attack process"),
+                (EXTRACTION, 2, "extraction"),
+                (TRAINING, 2, "training"),
+                (DASK, 2, "dask"),
+            )
+        ),
+    ],
 )
 def test_child_processes_end_with_a_killed_command(script: str, count: int, tmp_path: Path) -> None:
     write_album(tmp_path / "album", 18)

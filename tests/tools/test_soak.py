@@ -24,7 +24,7 @@ def test_a_reader_without_a_checksum_fails_the_soak_test(tmp_path: Path, rng: np
     assert soak.flip_bits(b"0.58", tmp_path / "flipped", Path.read_bytes, 10, rng) == (0, 10)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_killed_run_resumes_with_equal_results(tmp_path: Path) -> None:
     _, trials, _, wrong = soak.kill_and_resume(tmp_path, 1, np.random.default_rng(2))
     assert (trials, wrong) == (1, 0)

@@ -302,6 +302,7 @@ def same_weights(one: nn.Module, other: nn.Module) -> bool:
     return all(torch.equal(value, values[name]) for name, value in one.state_dict().items())
 
 
+@pytest.mark.exhaustive
 def test_both_networks_are_trained_and_the_attack_loads_them(
     world: World, stacked: data.TrainingData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
