@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from bench.api import Metric
 from bench.core.errors import UserError
-from bench.formats.pretrained import INSTALLED, find_weights
+from bench.formats.pretrained import find_weights
 from bench.geometry.metric_inputs import Doubles, validate_images
 from bench.identification import faces
 from bench.types import Bytes, Floats
