@@ -65,17 +65,20 @@ class SuiteResult:
 
 
 def list_results(group: ComparisonGroup) -> list[SuiteResult]:
-    """Return the results of each defense under the latest suite, and under each earlier one that it has all results of.
+    """Return the results of each defense under all suites that it has the results of; if there are none, under the latest suite.
 
-    Defenses without a record of an attack of the suite are left out.
+    Defenses without a record of an attack of the latest suite are left out then.
     """
     suites = [attack_suite.find(name) for name in attack_suite.list_attack_suites()]
     by_defense: dict[str, list[GroupedExperiment]] = {}
     for experiment in group.experiments:
         if experiment.metadata["attack"] is not None:
             by_defense.setdefault(canonical_json(experiment.metadata["defense"]), []).append(experiment)
-    results = (build_result(group, suite, experiments) for suite in suites for experiments in by_defense.values())
-    return [one for one in results if any(one.experiments.values()) and (one.version or one.suite == suites[-1].name)]
+    chosen: list[SuiteResult] = []
+    for experiments in by_defense.values():
+        results = [build_result(group, suite, experiments) for suite in suites]
+        chosen += [one for one in results if one.version] or [one for one in results[-1:] if any(one.experiments.values())]
+    return chosen
 
 
 def build_result(group: ComparisonGroup, suite: AttackSuite, experiments: Sequence[GroupedExperiment]) -> SuiteResult:

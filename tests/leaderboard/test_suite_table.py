@@ -12,7 +12,8 @@ from fabricated import inapplicable, ldp, reconstructions
 from bench.core.table import to_csv, to_markdown
 from bench.registry import discovery, spec
 from bench.runner import attack_suite
-from leaderboard import comparison
+from bench.runner.attack_suite import AttackSuite
+from leaderboard import comparison, site
 from leaderboard.attack_flags import NOT_MONOTONE, WEAKER, flag_attacks, knows_less
 from leaderboard.comparison import ComparisonGroup
 from leaderboard.suite_table import build_run_tables, build_suite_table
@@ -106,6 +107,21 @@ def test_an_attack_without_a_network_is_missing_until_one_is_trained(tmp_path: P
     assert find_result(build_group(tmp_path / "trained", [*records, *trained])).version == STANDARD
 
 
+def test_old_rows_keep_their_version(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    old = attack_suite.find(STANDARD)
+    specs = tuple("repeat:releases=3" if text == "repeat:releases=2" else text for text in old.specs)
+    suites = {one.name: one for one in (old, AttackSuite(name="standard-2026.2", summary="", specs=specs))}
+    monkeypatch.setattr(attack_suite, "list_attack_suites", lambda: list(suites))
+    monkeypatch.setattr(attack_suite, "find", suites.__getitem__)
+    records = run_suite()
+    assert find_result(build_group(tmp_path / "old", records)).version == STANDARD
+    partial = find_result(build_group(tmp_path / "partial", run_suite(without=["lattice"])))
+    assert (partial.version, partial.suite) == (None, "standard-2026.2")
+    again = [rebuild(one, attack=one["attack"] | {"releases": 3}) for one in records if one["attack"]["name"] == "repeat"]
+    results = list_results(build_group(tmp_path / "both", [*records, *again]))
+    assert [result.version for result in results] == list(suites)
+
+
 def test_flags_only_of_attacks_that_failed(tmp_path: Path) -> None:
     assert list_flags(build_group(tmp_path, run_suite())) == []
 
@@ -187,3 +203,13 @@ def test_table_of_an_incomplete_run_lists_what_is_missing(tmp_path: Path) -> Non
     assert {row.note for row in table.rows} == {"missing: lattice:longest=520 (not run)"}
     assert build_run_tables(records) == []  # the report of a run of single attacks is as before
     assert len(build_run_tables(run_suite())) == 1
+
+
+@pytest.mark.slow
+def test_the_page_shows_the_worst_cases(tmp_path: Path) -> None:
+    fabricated.write(tmp_path / "results", run_suite())
+    page = site.write([tmp_path / "results"], tmp_path / "site").page.read_text(encoding="utf-8")
+    assert "Worst case over a suite of attacks" in page
+    assert f"<td>{STANDARD}</td>" in page
+    (table,) = (tmp_path / "site" / "tables").glob("*-worst-case.csv")
+    assert STANDARD in table.read_text(encoding="utf-8")
