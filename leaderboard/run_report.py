@@ -39,13 +39,13 @@ def write(records: Sequence[Record], out: Path, command: str) -> None:
             _write_figure(sample, sample_records, out, provenance)
 
 
-def build_suite_tables(records: Sequence[Record]) -> list[Table]:
+def build_suite_tables(records: Sequence[Record], *, brief: bool = False) -> list[Table]:
     """Return the worst cases over the suites of attacks that were run, one table for each comparison group."""
     if not any(record["attack"] for record in records):
         return []
     from leaderboard.suite_table import build_run_tables  # expensive: imports scipy
 
-    return build_run_tables(records)
+    return build_run_tables(records, brief=brief)
 
 
 def _write_figure(sample: str, records: Sequence[Record], out: Path, provenance: str) -> None:

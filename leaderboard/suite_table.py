@@ -12,7 +12,7 @@ from leaderboard.attack_flags import Flag, flag_attacks
 from leaderboard.comparison import ComparisonGroup, LocatedRecord, build_groups
 from leaderboard.group_tables import INTERVAL_REMARK
 from leaderboard.intervals import Interval
-from leaderboard.measures import Measure
+from leaderboard.measures import RANKING, Measure
 from leaderboard.signal import BASELINES
 from leaderboard.tables import format_fraction, format_interval
 from leaderboard.worst_case import SuiteResult, WorstCase, list_results
@@ -31,8 +31,11 @@ _LABELS = ("defense", "suite", "measure", "worst case", "attack", "signal", *BAS
 _TEXTS = ("defense", "suite", "measure", "attack", "signal", "flags")
 
 
-def build_suite_table(group: ComparisonGroup) -> Table | None:
-    """Return the table of all defenses with results under a suite of attacks; None if there are none."""
+def build_suite_table(group: ComparisonGroup, *, brief: bool = False) -> Table | None:
+    """Return the table of all defenses with results under a suite of attacks; None if there are none.
+
+    A `brief` table is for a terminal: it has the measures that rank defenses alone.
+    """
     results = [result for result in list_results(group) if result.worst_cases]
     if not results:
         return None
@@ -43,17 +46,22 @@ def build_suite_table(group: ComparisonGroup) -> Table | None:
     return Table(
         heading=f"Worst case over a suite of attacks. {', '.join([group.title, *group.facts])}",
         columns=tuple(Column(label=label, text=label in _TEXTS) for label in _LABELS),
-        rows=tuple(_build_row(group, result, worst, flags[result.suite]) for result in results for worst in result.worst_cases),
+        rows=tuple(
+            _build_row(group, result, worst, flags[result.suite])
+            for result in results
+            for worst in result.worst_cases
+            if not brief or worst.measure.name in RANKING
+        ),
         remarks=REMARKS,
         note_column=_LABELS.index("suite"),
     )
 
 
-def build_run_tables(records: Sequence[Record]) -> list[Table]:
+def build_run_tables(records: Sequence[Record], *, brief: bool = False) -> list[Table]:
     """Return the tables of a run whose records have every attack of a suite for at least one defense."""
     groups = build_groups([LocatedRecord(record, Path()) for record in records])
     complete = [group for group in groups if any(result.is_complete_run for result in list_results(group))]
-    return [table for group in complete if (table := build_suite_table(group))]
+    return [table for group in complete if (table := build_suite_table(group, brief=brief))]
 
 
 def _build_row(group: ComparisonGroup, result: SuiteResult, worst: WorstCase, flags: Sequence[Flag]) -> Row:

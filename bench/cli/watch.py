@@ -36,4 +36,4 @@ def print_tables(records: Sequence[Record]) -> None:
     from leaderboard.run_report import build_suite_tables
     from leaderboard.tables import build_tables
 
-    print_rich(*build_tables(records, brief=True, foldable=sys.stdout.isatty()), *build_suite_tables(records))
+    print_rich(*build_tables(records, brief=True, foldable=sys.stdout.isatty()), *build_suite_tables(records, brief=True))
