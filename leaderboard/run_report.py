@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from bench.core.table import to_csv, to_markdown
+from bench.core.table import Table, to_csv, to_markdown
 from bench.runner.directory import figure_path, photograph_path, reconstruction_path
 from bench.runner.records import Record
 from leaderboard import figures, tables
@@ -27,7 +27,7 @@ def write(records: Sequence[Record], out: Path, command: str) -> None:
         if a file cannot be written.
     """
     report = tables.build_tables(records)
-    markdown = "\n".join(to_markdown(table, plain=True) for table in report)
+    markdown = "\n".join(to_markdown(table, plain=True) for table in (*report, *build_suite_tables(records)))
     (out / "report.md").write_text(markdown, encoding="utf-8", errors="replace")
     (out / "report.csv").write_text(to_csv(*report), encoding="utf-8", errors="replace")
     provenance = format_provenance(command, records)
@@ -37,6 +37,15 @@ def write(records: Sequence[Record], out: Path, command: str) -> None:
     for sample, sample_records in by_sample.items():
         if any(os.path.isfile(reconstruction_path(out, record)) for record in sample_records):
             _write_figure(sample, sample_records, out, provenance)
+
+
+def build_suite_tables(records: Sequence[Record], *, brief: bool = False) -> list[Table]:
+    """Return the worst cases over the suites of attacks that were run, one table for each comparison group."""
+    if not any(record["attack"] for record in records):
+        return []
+    from leaderboard.suite_table import build_run_tables  # expensive: imports scipy
+
+    return build_run_tables(records, brief=brief)
 
 
 def _write_figure(sample: str, records: Sequence[Record], out: Path, provenance: str) -> None:

@@ -32,7 +32,8 @@ def execute_with_progress(plans: Sequence[Plan], out: Path, engine: Engine, titl
 
 
 def print_tables(records: Sequence[Record]) -> None:
-    """Print the tables of records."""
+    """Print the tables of records, and the worst cases over the suites of attacks that were run."""
+    from leaderboard.run_report import build_suite_tables
     from leaderboard.tables import build_tables
 
-    print_rich(*build_tables(records, brief=True, foldable=sys.stdout.isatty()))
+    print_rich(*build_tables(records, brief=True, foldable=sys.stdout.isatty()), *build_suite_tables(records, brief=True))

@@ -17,7 +17,7 @@ from bench.core.environment import DISTRIBUTION
 from bench.core.errors import UserError
 from bench.core.progress import Progress
 from bench.core.table import Table, to_csv, to_latex, to_markdown
-from leaderboard import group_tables, plots, recipe
+from leaderboard import group_tables, plots, recipe, suite_table
 from leaderboard.comparison import ComparisonGroup, build_groups, load_records
 from leaderboard.provenance import format_provenance
 from leaderboard.recipe import Lookup
@@ -77,7 +77,10 @@ def _write_group(
     tradeoffs = build_tradeoffs(group, groups) if group.has_attacks else []
     name = _build_file_name(group)
     table = group_tables.build_pairs_table(group)
-    tables = {"pairs": table} | ({"ranking": group_tables.build_ranking_table(group)} if group.has_attacks else {})
+    tables: dict[str, Table] = {"pairs": table}
+    tables |= {"ranking": group_tables.build_ranking_table(group)} if group.has_attacks else {}
+    suite = suite_table.build_suite_table(group)
+    tables |= {"worst-case": suite} if suite else {}
     views = []
     for row in table.rows:
         views.append(experiments.build_view(group, table, row, tradeoffs, out, lookup))
@@ -87,11 +90,12 @@ def _write_group(
     return {
         "group": group,
         "table": table,
+        "suite": suite,
         "columns": experiments.select_columns(table),
         "experiments": views,
         "overview": build_overview(group, views),
         "charts": build_charts(tradeoffs),
-        "tables": [_write_tables(table, f"{name}-{kind}", out) for kind, table in tables.items()],
+        "tables": {kind: _write_tables(table, f"{name}-{kind}", out) for kind, table in tables.items()},
         "plots": [_write_plot(f"{name}-{_slugify(kind)}", kind, figure, provenance, out) for kind, figure in figures],
     }
 

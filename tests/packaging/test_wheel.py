@@ -40,6 +40,8 @@ def test_contains_packages_and_assets_but_no_tests(wheel):
         assert f"leaderboard/reproduce/paper/{path.name}" in names
     for path in (ROOT / "leaderboard" / "site" / "page").iterdir():
         assert f"leaderboard/site/page/{path.name}" in names
+    for path in (ROOT / "suites").glob("*.toml"):
+        assert f"suites/{path.name}" in names
     assert wheel.name.startswith("feature_privacy_bench-")
 
 

@@ -22,6 +22,7 @@ Every given defense is combined with every given attack.
 
 examples:
   bench run --defense ldp --attack dia
+  bench run --defense ldp --attack standard-2026.1
   bench run --defense none --defense ldp:epsilon=inf --attack dia --extractor sift:upright=false --images DIR --json
 """
 REQUIRED = ("defense",)
@@ -29,7 +30,12 @@ REQUIRED = ("defense",)
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--defense", action="append", metavar="SPEC", help="a defense; may be repeated")
-    parser.add_argument("--attack", action="append", metavar="SPEC", help="an attack; may be repeated")
+    parser.add_argument(
+        "--attack",
+        action="append",
+        metavar="SPEC",
+        help="an attack, or a suite of attacks such as standard-2026.1; may be repeated",
+    )
     parser.add_argument(
         "--task", metavar="SPEC", default="reconstruction", help="the task that evaluates the releases (default: %(default)s)"
     )
@@ -56,7 +62,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def execute(args: argparse.Namespace) -> int:
     from bench.cli import watch
     from bench.registry import discovery, spec
-    from bench.runner import engines
+    from bench.runner import attack_suite, engines
     from bench.runner.plan import RunConfiguration, build_plan, cross, list_extra_metrics
     from bench.runner.trial import dry_run
     from leaderboard import localization_results, run_report
@@ -65,7 +71,7 @@ def execute(args: argparse.Namespace) -> int:
     task = spec.read(args.task, discovery.TASK)
     _check_attacks(task, args.attack)
     defenses = [_read_defense(text, task) for text in args.defense]
-    attacks = [spec.read(text, discovery.ATTACK) for text in args.attack or []]
+    attacks = attack_suite.read_attacks(args.attack or [])
     metrics = [_read_metric(text) for text in args.metric]
     given = {metric.name() for metric in metrics}
     configuration = RunConfiguration(
