@@ -16,7 +16,11 @@ from pathlib import Path
 from bench.cli import main as bench
 from bench.codebook.public import ASSETS
 
-WORDS, PUBLIC_WORDS = 256_000, 128_000
+DICTIONARIES = (  # file, set of photographs, words, extractor
+    ("dictionary", "01", 256_000, "sift"),
+    ("public-database", "2", 128_000, "sift"),
+    ("dictionary-xfeat", "01", 16_000, "xfeat"),
+)
 DEFENSES = ("none", "affine")
 SETS = ("01", "02", "12", "2", "012")  # of thirds of the photographs
 
@@ -30,8 +34,8 @@ def main() -> None:
     parser.add_argument("--oriented-steps", type=int, default=20_800, help="of the network for oriented descriptors")
     args = parser.parse_args()
     folders = split_photographs(args.data, args.work / "photographs")
-    for file, photographs, words in (("dictionary", "01", WORDS), ("public-database", "2", PUBLIC_WORDS)):
-        build = "dictionary", "build", "--images", folders[photographs], "--size", words
+    for file, photographs, words, extractor in DICTIONARIES:
+        build = "dictionary", "build", "--images", folders[photographs], "--size", words, "--extractor", extractor
         ship(run_once(args.work / f"{file}.safetensors", *build))
     unseen = ["--validation", folders["tune"]]
     given = ["--images", folders["012"], *unseen]

@@ -23,7 +23,6 @@ SHIPPED = {
     "shipped": "dictionary.safetensors",
     "shipped-public": "public-database.safetensors",
     "shipped-xfeat": "dictionary-xfeat.safetensors",
-    "shipped-aliked": "dictionary-aliked.safetensors",
 }
 REFERENCES = "references"
 CLUSTERED = {"shipped-clustered": "shipped"}  # dictionaries that are clustered from the words of another one
@@ -60,7 +59,7 @@ class Public:
         self._cache_size = cache_size
 
     def dictionary(self, asset: str, words: int = 0) -> Dictionary:
-        """Return the first `words` words (0: all) of `shipped`, of `shipped-public` or of a file.
+        """Return the first `words` words (0: all) of a shipped dictionary (`SHIPPED`) or of a file.
 
         For `references`, return that many words, clustered from the reference images of the scene. For `shipped-clustered`,
         return that many words, clustered from the words of `shipped`.

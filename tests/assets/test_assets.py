@@ -6,7 +6,7 @@ import pytest
 
 import bench
 from attacks.dia import DIA
-from bench.codebook.public import ASSETS, Public
+from bench.codebook.public import ASSETS, SHIPPED, Public
 from bench.context import weights as context
 from bench.extractors.sift import Sift
 from bench.images import photographs
@@ -37,9 +37,10 @@ def test_all_together_stay_under_95_megabytes():
 
 @pytest.mark.slow
 def test_dictionaries(public):
-    k, z = public.dictionary("shipped"), public.dictionary("shipped-public")
-    assert (len(k), len(z)) == (256_000, 128_000)
-    for words in (k, z):
+    k, z, xfeat = (public.dictionary(name) for name in ("shipped", "shipped-public", "shipped-xfeat"))
+    assert (k.words.shape, z.words.shape, xfeat.words.shape) == ((256_000, 128), (128_000, 128), (16_000, 64))
+    assert k.photographs == xfeat.photographs
+    for words in (k, z, xfeat):
         assert len(np.unique(words.words, axis=0)) == len(words)
         assert words.words.any(axis=1).all()
     assert not k.photographs & z.photographs, "the attacker's database must be built from other photographs"
@@ -51,7 +52,7 @@ def test_no_dictionary_was_built_from_tuning_or_test_photographs(public, shared_
     names = [name for split in ("tune.txt", "test.txt") for name in (shared_data / split).read_text().split()]
     held_out = {photographs.Source(name, shared_data / "train" / name).content_hash() for name in names}
     assert len(held_out) == 200
-    for asset in ("shipped", "shipped-public"):
+    for asset in SHIPPED:
         assert not held_out & public.dictionary(asset).photographs
 
 
