@@ -16,8 +16,9 @@ from pathlib import Path
 from bench.cli import main as bench
 from bench.codebook.public import ASSETS
 
+WORDS = 256_000
 DICTIONARIES = (  # file, set of photographs, words, extractor
-    ("dictionary", "01", 256_000, "sift"),
+    ("dictionary", "01", WORDS, "sift"),
     ("public-database", "2", 128_000, "sift"),
     ("dictionary-xfeat", "01", 16_000, "xfeat"),
 )
