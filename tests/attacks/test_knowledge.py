@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -86,16 +87,16 @@ def reparameterise(release: Subspaces, rng: np.random.Generator) -> Subspaces:
     return dataclasses.replace(release, origins=origins.astype(np.float32), bases=bases.astype(np.float32))
 
 
-def list_subspace_attacks() -> list[type[Attack]]:
+def list_subspace_attacks() -> list[Any]:
+    """Return the attacks on subspaces: a fast one for `make test`, all others for the exhaustive tests."""
     return [
-        attack
+        pytest.param(attack, marks=pytest.mark.slow if attack.name() == "nearest" else pytest.mark.exhaustive, id=attack.name())
         for attack in discovery.load_plugins(discovery.ATTACK)
         if issubclass(attack, DescriptorAttack) and Subspaces in attack.accepts
     ]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("plugin", list_subspace_attacks(), ids=lambda plugin: plugin.name())
+@pytest.mark.parametrize("plugin", list_subspace_attacks())
 def test_the_random_basis_has_no_effect(plugin, database, secret):
     defense = Affine(dim=4, database=database, sub_databases=SUB_DATABASES)
     attack = spec.build(plugin, {})

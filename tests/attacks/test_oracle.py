@@ -81,7 +81,7 @@ def test_it_applies_to_word_sets_alone(defense):
     assert "oracle" in (Oracle().explain_not_applicable(defense, Sift(), Public()) or "")
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_it_exceeds_the_attack_where_few_words_are_true():
     """At ε = 10 about 15% of the sets contain the true word."""
     from bench.images.photographs import list_builtin
