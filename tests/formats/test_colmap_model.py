@@ -1,5 +1,6 @@
 """COLMAP's sparse models against pycolmap's reader, and damaged ones."""
 
+import contextlib
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -119,7 +120,8 @@ def test_every_image_needs_its_line_of_points(text: Path) -> None:
     edit(
         text / "images.txt", lambda content: "\n".join(row for row in content.split("\n") if len(row.split()) == 10 or "#" in row)
     )
-    assert pycolmap.Reconstruction(text).num_images() < len(NAMES)  # the reference shows the fault
+    with contextlib.suppress(ValueError):  # COLMAP 4.0 stops at the name
+        assert pycolmap.Reconstruction(text).num_images() < len(NAMES)  # the reference shows the fault
     with pytest.raises(UserError, match=r"images\.txt:6: a line of points .* follows each image's, not '2 "):
         colmap_model.read(text)
 

@@ -210,6 +210,6 @@ def test_networks_with_a_right_digest_and_wrong_metadata(tmp_path: Path, spoil: 
 )
 def test_context_networks_with_a_right_digest_and_wrong_metadata(tmp_path: Path, meta: dict[str, Any]) -> None:
     path = tmp_path / "w.safetensors"
-    tensor_file.save(path, context_weights.KIND, {}, meta)
+    tensor_file.save(path, context_weights.KIND, {"weight": np.zeros(1, np.float32)}, meta)
     with pytest.raises(UserError, match="metadata"):
         context_weights.load(path).verify()
