@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Literal
 
 from bench.api import Metric
 from bench.core.errors import UserError
-from bench.geometry.metric_inputs import Doubles, validate_images
+from bench.geometry.metric_inputs import to_tensors
 from bench.types import Floats
 
 
@@ -45,16 +45,9 @@ class LPIPS(Metric):
         import torch
 
         # (H, W, 3) in [0, 1] each
-        images = [_to_tensor(image) for image in validate_images(truth, estimate)]
+        images = to_tensors(truth, estimate)
         with torch.no_grad():
             return float(_load_network(self.weights)(*images, normalize=True))
-
-
-def _to_tensor(image: Doubles) -> Any:
-    """Return an image as a tensor. (H, W, 3) -> (1, 3, H, W) float32"""
-    import torch
-
-    return torch.from_numpy(image.astype("float32")).permute(2, 0, 1)[None]
 
 
 @functools.lru_cache(maxsize=1)

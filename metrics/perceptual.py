@@ -20,7 +20,7 @@ from typing import Any, ClassVar, Literal
 from bench.api import Metric
 from bench.core.errors import UserError
 from bench.formats.pretrained import INSTALLED, find_weights, read_weights
-from bench.geometry.metric_inputs import Doubles, validate_images
+from bench.geometry.metric_inputs import to_tensors
 from bench.types import Floats
 
 FILE = "stlpips_pytorch/weights/vST0.0/alex_shift_tolerant.pth"
@@ -51,16 +51,9 @@ class Perceptual(Metric):
         import torch
 
         # (H, W, 3) in [0, 1] each
-        images = [_to_tensor(image) for image in validate_images(truth, estimate)]
+        images = to_tensors(truth, estimate)
         with torch.inference_mode():
             return float(_load_network(self.weights)(*images, normalize=True))
-
-
-def _to_tensor(image: Doubles) -> Any:
-    """Return an image as a tensor. (H, W, 3) -> (1, 3, H, W) float32"""
-    import torch
-
-    return torch.from_numpy(image.astype("float32")).permute(2, 0, 1)[None]
 
 
 @functools.lru_cache(maxsize=1)

@@ -17,6 +17,7 @@ import numpy as np
 from bench.api import Extractor
 from bench.core.errors import UserError
 from bench.extractors.sift import Sift
+from bench.formats.pretrained import to_tensor
 from bench.geometry.nearest_words import unit_rows
 from bench.images.photographs import Source
 from bench.types import Features, Floats
@@ -67,7 +68,7 @@ def _describe(image: np.ndarray, keypoints: Floats, diameters: Floats, path: Pat
     import torch
 
     kornia, network = _load_network(path, path.stat().st_mtime_ns)
-    grey = kornia.color.rgb_to_grayscale(torch.from_numpy(image.transpose(2, 0, 1).copy())[None].float() / 255)  # (1, 1, H, W)
+    grey = kornia.color.rgb_to_grayscale(to_tensor(image))  # (1, 1, H, W)
     centres = torch.from_numpy(keypoints - np.float32(0.5))[None]  # kornia's centre of the first pixel is (0, 0)
     scales = torch.from_numpy(diameters * np.float32(RADIUS))[None, :, None, None]
     frames = kornia.feature.laf_from_center_scale_ori(centres, scales)  # (1, N, 2, 3)

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import NDArray
 
 from bench.types import Floats
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 Doubles = NDArray[np.float64]
 
@@ -25,6 +30,14 @@ def validate_images(truth: Floats, estimate: Floats) -> tuple[Doubles, Doubles]:
         if not (image.min() >= 0 and image.max() <= 1):  # NaN is refused too
             raise ValueError(f"{name}: values must be in [0, 1] and no NaN, got {image.min()} to {image.max()}")
     return truth.astype(np.float64), estimate.astype(np.float64)
+
+
+def to_tensors(truth: Floats, estimate: Floats) -> tuple[Tensor, Tensor]:
+    """Validate two images, and return them as networks read them. (H, W, 3) twice -> (1, 3, H, W) float32 twice"""
+    import torch
+
+    one, other = (torch.from_numpy(image.astype(np.float32)).permute(2, 0, 1)[None] for image in validate_images(truth, estimate))
+    return one, other
 
 
 def validate_descriptors(truth: Floats, estimate: Floats) -> tuple[Doubles, Doubles]:
