@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import permutations
 from typing import Any
@@ -95,12 +95,9 @@ def _flag_weaker(results: Sequence[SuiteResult], values: Mapping[GroupedExperime
         if _knows_more(one, other)
         for comparison in _compare(one, other, values)
     ]
-    # of several attacks with less knowledge, the one that scores the highest
-    strongest: dict[tuple[GroupedExperiment, str], _Comparison] = {}
-    for one in _select_lower(comparisons):
-        strongest.setdefault((one.experiment, one.metric), one)
-    for (experiment, metric), one in strongest.items():
-        yield Flag(experiment=experiment, metric=metric, text=f"{WEAKER}: {experiment.attack} than {one.other.attack}")
+    for lower in _select_lower(comparisons):
+        text = f"{WEAKER}: {lower.experiment.attack} than {lower.other.attack}"
+        yield Flag(experiment=lower.experiment, metric=lower.metric, text=text)
 
 
 def _knows_more(one: GroupedExperiment, other: GroupedExperiment) -> bool:
@@ -118,7 +115,7 @@ def _find_attack(name: str) -> type[Attack] | None:
 
 
 def _flag_not_monotone(results: Sequence[SuiteResult], values: Mapping[GroupedExperiment, SampleValues]) -> Iterator[Flag]:
-    """Yield one flag for each attack and metric of an ε: that of the ε with the highest score among the smaller ones."""
+    """Yield one flag for each attack and metric of an ε, with the smaller ε of the greatest score."""
     series: dict[str, list[GroupedExperiment]] = {}
     for result in results:
         for text, experiments in result.experiments.items():
@@ -133,16 +130,10 @@ def _flag_not_monotone(results: Sequence[SuiteResult], values: Mapping[GroupedEx
         if get_epsilon(one) > get_epsilon(other)
         for comparison in _compare(one, other, values)
     ]
-    highest: dict[tuple[GroupedExperiment, str], _Comparison] = {}
-    for comparison in _select_lower(comparisons):
-        highest.setdefault((comparison.experiment, comparison.metric), comparison)
-    for (experiment, metric), comparison in highest.items():
-        larger, smaller = get_epsilon(experiment), get_epsilon(comparison.other)
-        yield Flag(
-            experiment=experiment,
-            metric=metric,
-            text=f"{NOT_MONOTONE}: {experiment.attack} scores lower at {larger:g} than at {smaller:g}",
-        )
+    for lower in _select_lower(comparisons):
+        larger, smaller = get_epsilon(lower.experiment), get_epsilon(lower.other)
+        text = f"{NOT_MONOTONE}: {lower.experiment.attack} scores lower at {larger:g} than at {smaller:g}"
+        yield Flag(experiment=lower.experiment, metric=lower.metric, text=text)
 
 
 def get_epsilon(experiment: GroupedExperiment) -> float:
@@ -168,8 +159,14 @@ def _compare(
             yield _Comparison(experiment=one, other=other, metric=metric, difference=estimate_mean(differences))
 
 
-def _select_lower(comparisons: Sequence[_Comparison]) -> list[_Comparison]:
-    """Return the comparisons whose first experiment scores significantly lower, those with the greatest difference first."""
+def _select_lower(comparisons: Sequence[_Comparison]) -> Iterable[_Comparison]:
+    """Return the comparisons whose first experiment scores significantly lower.
+
+    Of several with the same first experiment and metric, only the one with the greatest difference is returned.
+    """
     p_values = correct_holm([one.difference.p_below(0.0) for one in comparisons])
     lower = [one for one, p_value in zip(comparisons, p_values, strict=True) if p_value < SIGNIFICANCE]
-    return sorted(lower, key=lambda one: one.difference.mean)
+    greatest: dict[tuple[GroupedExperiment, str], _Comparison] = {}
+    for one in sorted(lower, key=lambda one: one.difference.mean):
+        greatest.setdefault((one.experiment, one.metric), one)
+    return greatest.values()

@@ -10,6 +10,7 @@ import numpy as np
 from PIL import Image
 
 from bench.core.table import Table, to_csv, to_markdown
+from bench.runner import attack_suite
 from bench.runner.directory import figure_path, photograph_path, reconstruction_path
 from bench.runner.records import Record
 from leaderboard import figures, tables
@@ -41,7 +42,8 @@ def write(records: Sequence[Record], out: Path, command: str) -> None:
 
 def build_suite_tables(records: Sequence[Record], *, brief: bool = False) -> list[Table]:
     """Return the worst cases over the suites of attacks that were run, one table for each comparison group."""
-    if not any(record["attack"] for record in records):
+    names = {record["attack"]["name"] for record in records if record["attack"]}
+    if not any(attack_suite.find(suite).names <= names for suite in attack_suite.list_attack_suites()):
         return []
     from leaderboard.suite_table import build_run_tables  # expensive: imports scipy
 

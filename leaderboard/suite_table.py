@@ -31,12 +31,24 @@ _LABELS = ("defense", "suite", "measure", "worst case", "attack", "signal", *BAS
 _TEXTS = ("defense", "suite", "measure", "attack", "signal", "flags")
 
 
-def build_suite_table(group: ComparisonGroup, *, brief: bool = False) -> Table | None:
-    """Return the table of all defenses with results under a suite of attacks; None if there are none.
+def build_suite_table(group: ComparisonGroup) -> Table | None:
+    """Return the table of all defenses with results under a suite of attacks; None if there are none."""
+    return _build_table(group, list_results(group))
 
-    A `brief` table is for a terminal: it has the measures that rank defenses alone.
+
+def build_run_tables(records: Sequence[Record], *, brief: bool = False) -> list[Table]:
+    """Return the tables of a run whose records have every attack of a suite for at least one defense.
+
+    `brief` tables are for a terminal: they have the measures that rank defenses alone.
     """
-    results = [result for result in list_results(group) if result.worst_cases]
+    groups = build_groups([LocatedRecord(record, Path()) for record in records])
+    results = [(group, list_results(group)) for group in groups]
+    tables = [_build_table(group, each, brief) for group, each in results if any(one.is_complete_run for one in each)]
+    return [table for table in tables if table]
+
+
+def _build_table(group: ComparisonGroup, every: Sequence[SuiteResult], brief: bool = False) -> Table | None:
+    results = [result for result in every if result.worst_cases]
     if not results:
         return None
     flags = {
@@ -55,13 +67,6 @@ def build_suite_table(group: ComparisonGroup, *, brief: bool = False) -> Table |
         remarks=REMARKS,
         note_column=_LABELS.index("suite"),
     )
-
-
-def build_run_tables(records: Sequence[Record], *, brief: bool = False) -> list[Table]:
-    """Return the tables of a run whose records have every attack of a suite for at least one defense."""
-    groups = build_groups([LocatedRecord(record, Path()) for record in records])
-    complete = [group for group in groups if any(result.is_complete_run for result in list_results(group))]
-    return [table for group in complete if (table := build_suite_table(group, brief=brief))]
 
 
 def _build_row(group: ComparisonGroup, result: SuiteResult, worst: WorstCase, flags: Sequence[Flag]) -> Row:

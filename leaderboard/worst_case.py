@@ -19,7 +19,7 @@ from bench.runner.attack_suite import AttackSuite
 from leaderboard.comparison import ComparisonGroup, GroupedExperiment
 from leaderboard.intervals import Interval
 from leaderboard.measures import Measure
-from leaderboard.signal import BASELINES, is_baseline, is_oracle
+from leaderboard.signal import BASELINES, get_attack, is_oracle
 
 UNTRAINED = ("no adapted attacker", "trained for ")  # in the reason of an attack that lacks a network
 INVERSION = "inversion"  # entry of a record's attack: the network that inverts its result; None if there is none
@@ -127,12 +127,7 @@ def _find_worst_cases(group: ComparisonGroup, experiments: Sequence[GroupedExper
             measure=measure,
             score=attacks[worst],
             experiment=worst,
-            baselines={
-                name: score
-                for name in BASELINES
-                for one, score in attacks.items()
-                if is_baseline(one.metadata) and one.metadata["attack"]["name"] == name
-            },
+            baselines={name: score for name in BASELINES for one, score in attacks.items() if get_attack(one.metadata) == name},
             oracle=references[_find_worst(measure, references)] if references else None,
         )
 

@@ -30,6 +30,11 @@ class AttackSuite:
     summary: str
     specs: tuple[str, ...]  # one per attack, as on the command line
 
+    @property
+    def names(self) -> set[str]:
+        """The names of the attacks."""
+        return {text.partition(":")[0] for text in self.specs}
+
     def build_attacks(self) -> list[Attack]:
         """Return the attacks.
 
