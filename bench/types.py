@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 Indices = NDArray[np.int64]
-# Rows of integers, of which only the directions count: 8 bits as in SIFT, or 16 bits with sign.
+# Rows of integers, of which only the directions count: without sign as in SIFT, or with sign.
 Words = NDArray[np.uint8] | NDArray[np.int8]
 
 

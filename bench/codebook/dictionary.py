@@ -25,10 +25,10 @@ from bench.geometry.neighbours import Neighbours
 from bench.types import Bytes, Features, Floats, Words
 
 KIND = "dictionary"
-SIFT = 128  # length of 8-bit words
+SIFT = 128  # length of unsigned words
 NORM = 512.0  # of SIFT's 8-bit vectors
 SIGNED_NORM = 127.0  # of signed words; rounding turns them by about 0.02 radian, a word is about 0.5 radian from its descriptors
-MAX_NEGATIVE = 0.01  # greatest fraction of the squared norm in negative components of descriptors with 8-bit words: noise
+MAX_NEGATIVE = 0.01  # greatest fraction of the squared norm in negative components of descriptors with unsigned words: noise
 EXACT = 2**24  # squared norms below this give exact dot products in float32
 
 
