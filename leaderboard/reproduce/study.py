@@ -30,7 +30,8 @@ P = TypeVar("P", bound=Plugin)
 AS_PRINTED = "dia, as printed"
 AS_PRINTED_NOTE = (
     f"The rows `{AS_PRINTED}` are not in the paper. Their network reads origin and basis, or the words in their released order, "
-    "stacked as the paper prints. Architecture, training and the mean over symmetries are those of `dia`."
+    "stacked as the paper prints. No context model weighs the words. Architecture, training samples and the mean over symmetries "
+    "are those of `dia`."
 )
 
 
