@@ -11,7 +11,7 @@ from bench.core.hashing import canonical_json
 from leaderboard.comparison import ComparisonGroup, GroupedExperiment
 from leaderboard.figures import escape_text
 from leaderboard.intervals import Interval
-from leaderboard.measures import PRIVACY, list_measures
+from leaderboard.measures import PRIVACY, RANKING, Measure, list_measures
 from leaderboard.plot_style import PlotStyle, choose_styles, position_labels
 from leaderboard.ranking import Standing, average_baselines, rank_defenses
 from leaderboard.signal import Verdict
@@ -34,14 +34,16 @@ LETTER = 3.9, 9.0  # width and height of a letter of a label, in points
 def draw_plots(group: ComparisonGroup, tradeoffs: Sequence[Tradeoff]) -> Iterator[tuple[str, Figure]]:
     """Yield the name and the figure of each plot of a group with attacks."""
     ranked = rank_defenses(group)
-    if any(standing.score for standing in ranked):
-        yield "attacks", draw_attacks(group, ranked)
-    if curves := _collect_curves(ranked):
-        yield "epsilon", draw_epsilon(group, curves)
+    curves = _collect_curves(ranked)
+    for measure in list_measures(RANKING):
+        if any(group.average(experiment, measure) for experiment in group.experiments):
+            yield _name_plot("attacks", measure), draw_attacks(group, ranked, measure)
+            if curves:
+                yield _name_plot("epsilon", measure), draw_epsilon(group, curves, measure)
     several = len({tradeoff.utility_group.key for tradeoff in tradeoffs}) > 1
     for tradeoff in tradeoffs:
         key = tradeoff.utility_group.key[:8] if several else None
-        yield "-".join(filter(None, (TRADEOFF, tradeoff.condition, key))), draw_tradeoff(tradeoff)
+        yield _name_plot(TRADEOFF, tradeoff.privacy, tradeoff.condition, key), draw_tradeoff(tradeoff)
 
 
 def draw_tradeoff(tradeoff: Tradeoff) -> Figure:
@@ -65,12 +67,11 @@ def draw_tradeoff(tradeoff: Tradeoff) -> Figure:
     return figure
 
 
-def draw_attacks(group: ComparisonGroup, ranked: Sequence[Standing]) -> Figure:
+def draw_attacks(group: ComparisonGroup, ranked: Sequence[Standing], privacy: Measure) -> Figure:
     """Draw the score of each attack on each defense, one line per defense, with intervals and the baselines as lines.
 
     The marker of an attack without a signal is hollow, and that of the strongest attack on a defense is large.
     """
-    (privacy,) = list_measures([PRIVACY])
     experiments = [experiment for standing in ranked for experiment in standing.experiments]
     names = list(dict.fromkeys(experiment.attack for experiment in experiments if group.average(experiment, privacy)))
     height = ROW * len(ranked) * max(1.0, len(names) / 3)
@@ -84,14 +85,14 @@ def draw_attacks(group: ComparisonGroup, ranked: Sequence[Standing]) -> Figure:
                 (score, Interval(row + offset, -math.inf, math.inf, 1))
                 for row, standing in enumerate(ranked)
                 for experiment in standing.experiments
-                if experiment.attack == name and (experiment is standing.strongest) == large
+                if experiment.attack == name and (experiment is standing.represent(privacy)) == large
                 if _has_signal(group, experiment) == filled
                 if (score := group.average(experiment, privacy))
             ]
             _draw_points(axes, at, style, filled=filled, label=None, size=LARGE if large else SMALL)
         axes.plot([], [], style.marker, color=style.colour, label=_shorten(name))
     axes.plot([], [], "o", color="0.35", mfc="white", label=HOLLOW)
-    _draw_baselines(axes.axvline, average_baselines(group))
+    _draw_baselines(axes.axvline, average_baselines(group, privacy))
     axes.set_yticks(range(len(ranked)), [_label_standing(standing) for standing in ranked], fontsize=8)
     axes.set_ylim(len(ranked) - 0.5, -0.5)
     axes.set_xlabel(f"{privacy.label} →", fontsize=9)
@@ -99,13 +100,18 @@ def draw_attacks(group: ComparisonGroup, ranked: Sequence[Standing]) -> Figure:
     return figure
 
 
-def draw_epsilon(group: ComparisonGroup, curves: dict[str, list[Standing]]) -> Figure:
+def draw_epsilon(group: ComparisonGroup, curves: Mapping[str, Sequence[Standing]], privacy: Measure) -> Figure:
     """Draw the score of the strongest attack over the ε of a descriptor. It is hollow where it has no signal."""
-    (privacy,) = list_measures([PRIVACY])
     figure, axes = _create_axes(5.6, 3.6, ", ".join([group.title, *group.facts[:3]]))
+    complete = True  # whether each point has a signal
     for (label, curve), style in zip(curves.items(), choose_styles(curves).values(), strict=True):
-        at = [_get_epsilon(standing) for standing in curve]
-        scores = [standing.score for standing in curve if standing.score]
+        attacks = [(_get_epsilon(standing), standing.represent(privacy)) for standing in curve]
+        points = [
+            (epsilon, score, _has_signal(group, attack))
+            for epsilon, attack in attacks
+            if attack and (score := group.average(attack, privacy))
+        ]
+        at, scores = [epsilon for epsilon, _, _ in points], [score for _, score, _ in points]
         axes.plot(
             at,
             [score.mean for score in scores],
@@ -116,20 +122,24 @@ def draw_epsilon(group: ComparisonGroup, curves: dict[str, list[Standing]]) -> F
             lw=1.3,
             label=_shorten(label),
         )
-        hollow = [
-            (epsilon, score.mean) for epsilon, standing, score in zip(at, curve, scores, strict=True) if not standing.has_signal
-        ]
+        hollow = [(epsilon, score.mean) for epsilon, score, evident in points if not evident]
+        complete = complete and not hollow
         axes.plot([x for x, _ in hollow], [y for _, y in hollow], style.marker, color=style.colour, mfc="white", ms=5, zorder=3)
         low, high = [score.low for score in scores], [score.high for score in scores]
         if all(map(math.isfinite, low)):
             axes.fill_between(at, low, high, color=style.colour, alpha=0.12, lw=0)
-    if not all(standing.has_signal for curve in curves.values() for standing in curve):
+    if not complete:
         axes.plot([], [], "o", color="0.35", mfc="white", label=HOLLOW)
-    _draw_baselines(axes.axhline, average_baselines(group))
+    _draw_baselines(axes.axhline, average_baselines(group, privacy))
     axes.set_xlabel("ε of a descriptor", fontsize=9)
     axes.set_ylabel(f"{privacy.label} of the strongest attack", fontsize=9)
     axes.legend(fontsize=7, frameon=False)
     return figure
+
+
+def _name_plot(kind: str, measure: Measure, *parts: str | None) -> str:
+    """Return the name of a plot's file. That of the first measure has no part for it."""
+    return "-".join(filter(None, (kind, None if measure.name == PRIVACY else measure.name, *parts)))
 
 
 def label_standing(standing: Standing, family: str) -> str:

@@ -23,7 +23,7 @@ import numpy as np
 from bench.core.hashing import canonical_json
 from leaderboard.comparison import ComparisonGroup, GroupedExperiment
 from leaderboard.intervals import Interval
-from leaderboard.measures import PRIVACY, RANKING, list_measures
+from leaderboard.measures import PRIVACY, RANKING, Measure, list_measures
 from leaderboard.signal import BASELINES, Signal, Verdict, is_baseline, is_oracle
 
 ADAPTED = "dia"  # the attack whose network is trained for the defense; without it, a defense may look safe
@@ -43,10 +43,9 @@ class Standing:
     signal: Signal | None  # of the strongest attack
     rank: int | None = None  # 1 is the most private
 
-    @property
-    def has_signal(self) -> bool:
-        """Whether the score of the strongest attack is evidence."""
-        return self.signal is not None and self.signal.verdict is Verdict.SIGNAL
+    def represent(self, measure: Measure) -> GroupedExperiment | None:
+        """Return the attack that represents the defense in a plot of one of the measures `RANKING`."""
+        return self.strongest if measure.name == PRIVACY else self.identifying or self.strongest
 
     @property
     def configuration(self) -> dict[str, Any]:
@@ -71,9 +70,8 @@ def rank_defenses(group: ComparisonGroup) -> list[Standing]:
     ]
 
 
-def average_baselines(group: ComparisonGroup, condition: str | None = None) -> dict[str, float]:
-    """Return the mean of `PRIVACY` of each baseline that was run, over the defenses that it was run on."""
-    (privacy,) = list_measures([PRIVACY])
+def average_baselines(group: ComparisonGroup, privacy: Measure, condition: str | None = None) -> dict[str, float]:
+    """Return the mean of a measure of each baseline that was run, over the defenses that it was run on."""
     scores: dict[str, list[float]] = {}
     for experiment in group.experiments:
         score = group.average(experiment, privacy, condition) if is_baseline(experiment.metadata) else None

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from bench.core.hashing import canonical_json
 from leaderboard.comparison import ComparisonGroup, GroupedExperiment
 from leaderboard.intervals import Interval
-from leaderboard.measures import PRIVACY, UTILITY, Measure, list_measures
+from leaderboard.measures import RANKING, UTILITY, Measure, list_measures
 from leaderboard.ranking import Standing, average_baselines, rank_defenses
 
 
@@ -59,15 +59,17 @@ class Tradeoff:
 
 
 def build_tradeoffs(attack_group: ComparisonGroup, groups: Sequence[ComparisonGroup]) -> list[Tradeoff]:
-    """Return one tradeoff for each condition of each utility group with the same extractor, seeds and source.
+    """Return one tradeoff for each score that ranks, and each condition of each utility group.
 
-    Groups on other photographs are used only if no group has the same photographs, and matching only if localization is missing.
+    Both groups have the same extractor, seeds and source. Groups on other photographs are used only if no group has the same
+    photographs, and matching only if localization is missing.
     """
     for utility in list_measures(UTILITY):
         candidates = [one for one in groups if utility in one.measures and _shared_key(one) == _shared_key(attack_group)]
         same = [one for one in candidates if one.metadata["dataset"]["hash"] == attack_group.metadata["dataset"]["hash"]]
         tradeoffs = [
-            _build_tradeoff(attack_group, group, utility, condition)
+            _build_tradeoff(attack_group, group, privacy, utility, condition)
+            for privacy in list_measures(RANKING)
             for group in same or candidates
             for condition in group.conditions
         ]
@@ -88,14 +90,13 @@ def pareto(cost: ArrayLike, gain: ArrayLike) -> NDArray[np.bool_]:
 
 
 def _build_tradeoff(
-    attack_group: ComparisonGroup, utility_group: ComparisonGroup, utility: Measure, condition: str | None
+    attack_group: ComparisonGroup, utility_group: ComparisonGroup, privacy: Measure, utility: Measure, condition: str | None
 ) -> Tradeoff:
-    (privacy,) = list_measures([PRIVACY])
     complete = [one for one in utility_group.experiments if not one.reason and not utility_group.count_missing(one)]
     privacy_condition = condition if condition in attack_group.conditions else None
     pairs = []
     for standing in rank_defenses(attack_group):
-        served, strongest = _find_same_defense(standing, complete), standing.strongest
+        served, strongest = _find_same_defense(standing, complete), standing.represent(privacy)
         gain = utility_group.average(served, utility, condition) if served else None
         loss = attack_group.average(strongest, privacy, privacy_condition) if strongest else None
         if served and strongest and gain and loss:
@@ -122,7 +123,7 @@ def _build_tradeoff(
         privacy=privacy,
         utility=utility,
         points=points,
-        baselines=average_baselines(attack_group, privacy_condition),
+        baselines=average_baselines(attack_group, privacy, privacy_condition),
     )
 
 

@@ -78,10 +78,16 @@ class Scale:
 
 
 def build_charts(tradeoffs: Sequence[Tradeoff]) -> list[Chart]:
-    """Return the charts of one group. All have the same scales, so that they can be compared."""
+    """Return the charts of one group. Those of one measure have the same scales, so that they can be compared."""
+    by_measure: dict[str, list[Tradeoff]] = {}
+    for tradeoff in tradeoffs:
+        if tradeoff.points:
+            by_measure.setdefault(tradeoff.privacy.name, []).append(tradeoff)
+    return [chart for members in by_measure.values() for chart in _build_comparable_charts(members)]
+
+
+def _build_comparable_charts(tradeoffs: Sequence[Tradeoff]) -> list[Chart]:
     points = [point for tradeoff in tradeoffs for point in tradeoff.points]
-    if not points:
-        return []
     x = _fit_scale([point.utility for point in points], LEFT, WIDTH - RIGHT)
     baselines = [score for tradeoff in tradeoffs for score in tradeoff.baselines.values()]
     levels = [Interval(score, -math.inf, math.inf, 1) for score in baselines]

@@ -103,7 +103,7 @@ def build_view(
         recipe=build_recipe(experiment, lookup),
         settings=tuple(_list_settings(experiment)),
         failures=tuple(_list_failures(experiment)),
-        utilities=tuple(_list_utilities(experiment, tradeoffs)),
+        utilities=tuple(dict.fromkeys(_list_utilities(experiment, tradeoffs))),
     )
 
 

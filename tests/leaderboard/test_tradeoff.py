@@ -187,6 +187,34 @@ def test_labels_are_nearest_to_their_own_points() -> None:
 
 
 @pytest.mark.slow
+def test_identification_has_plots_of_its_own(tmp_path: Path) -> None:
+    """At `ldp` no attack has more SSIM than the baselines, but `nearest` identifies the photographs."""
+
+    def reconstruct(defense: dict[str, Any], attack: str, ssim: float, identified: float) -> list[dict[str, Any]]:
+        return [
+            record(f"{number}.png", {"ssim": ssim, "identified": identified}, defense=defense, attack={"name": attack})
+            for number in range(8)
+        ]
+
+    records = [
+        *(one for attack in ("blank", "keypoints") for one in reconstruct(NONE, attack, 0.2, 1 / 128)),
+        *reconstruct(NONE, "dia", 0.8, 1.0),
+        *reconstruct(ldp(8.0), "dia", 0.3, 1 / 8),
+        *reconstruct(ldp(8.0), "nearest", 0.2, 1.0),
+        *localizations(NONE, [1, 1], [None, None]),
+        *localizations(ldp(8.0), [1, 0], [None, None]),
+    ]
+    similarity, identification = build(tmp_path, records)
+    scores = {point.standing.configuration["name"]: point for point in identification.points}
+    assert (scores["ldp"].privacy.mean, scores["ldp"].attack_experiment.attack) == (1.0, "nearest")
+    assert {point.attack_experiment.attack for point in similarity.points} == {"dia"}
+    assert identification.baselines == {"blank": pytest.approx(1 / 128), "keypoints": pytest.approx(1 / 128)}
+    assert [chart.up for chart in build_charts([similarity])] != [chart.up for chart in build_charts([identification])]
+    names = [name for name, _ in plots.draw_plots(similarity.attack_group, [similarity, identification])]
+    assert names == ["attacks", "attacks-identified", "tradeoff", "tradeoff-identified"]
+
+
+@pytest.mark.slow
 def test_plots_are_drawn_of_the_available_records(tmp_path: Path) -> None:
     records = [
         *reconstructions(NONE, [0.8, 0.7] * 3),
