@@ -42,7 +42,7 @@ def write(kind: str, name: str, out: Path) -> list[Path]:
         raise UserError(f"{name!r} is not a valid plugin name: use lower-case letters, digits, and - between words")
     existing = discovery.discover(KINDS[kind])
     if name in existing:
-        raise UserError(f"a {kind} named {name!r} exists already: {existing[name].origin}")
+        raise UserError(f"{name!r} is taken by {existing[name].origin}; choose another name for the {kind}")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise UserError(f"{out}: exists already; give a new folder")
     values = {

@@ -1,4 +1,7 @@
-"""Every page and picture with results names a valid command and the files that it used, and these are the shipped ones."""
+"""Every page and picture with results names a valid command and the files that it used, and these are the shipped ones.
+
+Other documents hold no tables of scores, and tables of measurements only for the reasons in MEASUREMENTS.
+"""
 
 import re
 import shlex
@@ -12,6 +15,12 @@ from leaderboard.provenance import CHUNK, HEADING, list_stale
 from leaderboard.reproduce import command, tables
 
 ROOT = Path(__file__).resolve().parents[2]
+SCORES = {"MAE", "SSIM", "PSNR", "identified", "recovered", "angle", "mean reciprocal rank", "rank 1", "recall", "precision"}
+MEASUREMENTS = {  # documents with tables of times, memory or trials: why no digest of a network or dictionary can outdate them
+    "formats.md": "seconds of the extractors, which read neither networks nor dictionaries of ours",
+    "reliability.md": "seconds, memory and trials depend on the sizes of dictionaries and networks, and not on their content",
+    "service-cost.md": "operations, bytes and seconds depend on the sizes of dictionaries and networks, and not on their content",
+}
 RESULTS = [*sorted((ROOT / "docs" / "results").glob("*.md")), *sorted((ROOT / "docs" / "images").glob("*.png"))]
 
 
@@ -76,3 +85,39 @@ def test_pages_without_provenance_are_found() -> None:
 def test_invalid_commands_are_found(line: str, complaint: str) -> None:
     assert explain_invalid(PAGE) is None
     assert complaint in str(explain_invalid(PAGE.replace("bench reproduce table1\n", f"{line}\n")))
+
+
+# ---- other documents
+
+
+def list_columns(text: str) -> set[str]:
+    """Return the columns of all tables of a document, without what stands in parentheses."""
+    headers = re.findall(r"^\|(.+)\|\n\|(?: *:?-+:? *\|)+$", text, re.MULTILINE)
+    return {re.sub(r" \(.*\)", "", column).strip() for header in headers for column in header.split("|")}
+
+
+def is_measured(columns: set[str]) -> bool:
+    return any(re.search(r"\b(seconds|MB|trials)\b", column) for column in columns)
+
+
+OTHERS = {path.name: path.read_text(encoding="utf-8") for path in (ROOT / "docs").glob("*.md")}
+
+
+def test_scores_are_on_pages_with_provenance() -> None:
+    assert {name for name, text in OTHERS.items() if list_columns(text) & SCORES} == set()
+
+
+def test_documents_with_measurements_are_listed() -> None:
+    assert {name for name, text in OTHERS.items() if is_measured(list_columns(text))} == MEASUREMENTS.keys()
+
+
+def test_commands_of_measurements_are_valid() -> None:
+    for line in re.findall(r"`python (tools/\S+ [^`]+)`", OTHERS["reliability.md"]):
+        assert explain_invalid(f"{HEADING}\n```\npython {line}\n```") is None
+
+
+def test_scores_and_measurements_are_found() -> None:
+    assert list_columns(PAGE) & SCORES
+    assert list_columns("| attack | SSIM (mean) |\n| --- | ---: |\n| `dia` | 0.6 |\n") == {"attack", "SSIM"}
+    assert is_measured({"work", "core seconds"})
+    assert not is_measured({"verdict", "condition"})

@@ -124,7 +124,7 @@ def test_installed_packages_run_with_every_attack(tmp_path: Path) -> None:
         (("defense", "My Defense"), "is not a valid plugin name"),
         (("defense", "../up"), "is not a valid plugin name"),
         (("defense", "class"), "is not a valid plugin name"),
-        (("defense", "ldp"), "a defense named 'ldp' exists already: defenses.ldp"),
+        (("defense", "ldp"), "'ldp' is taken by defenses.ldp; choose another name for the defense"),
     ],
 )
 def test_invalid_arguments(
