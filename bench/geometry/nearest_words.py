@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 BLOCK = 2048  # words in a block, which fits into the cache with its scores
 BATCH = 512  # queries per pass over the words
+WIDE_BLOCK, WIDE_BATCH = 256, 1024  # in float32, whose products are so slow that reading all words again counts
 
 SLACK = 1e-4  # for sums in float32 and for products of errors
 
@@ -38,6 +39,7 @@ class WordIndex:
 
         device = pick_device()
         self._dtype = pick_dtype(device)
+        self._block, self._batch = (WIDE_BLOCK, WIDE_BATCH) if self._dtype == torch.float32 else (BLOCK, BATCH)
         self._words = words
         self._coarse = torch.empty(words.shape, dtype=self._dtype, device=device)  # (K, D)
         self._error = 0.0
@@ -62,11 +64,11 @@ class WordIndex:
         import torch
 
         found = np.empty(len(queries), dtype=np.int64)
-        for start in range(0, len(queries), BATCH):
-            batch = queries[start : start + BATCH]
+        for start in range(0, len(queries), self._batch):
+            batch = queries[start : start + self._batch]
             exact = torch.from_numpy(unit_rows(batch))
             coarse = exact.to(self._coarse.device, self._dtype)
-            found[start : start + BATCH] = self._decide(
+            found[start : start + self._batch] = self._decide(
                 batch, *self._find_candidates(coarse, rounding(exact, coarse) + self._error)
             )
             progress(len(batch))
@@ -76,19 +78,19 @@ class WordIndex:
         """Return the pairs of a query and a word that may be its nearest. (n, D), (n,) rounding errors -> (P,), (P,)"""
         import torch
 
-        blocks = self._coarse.split(BLOCK)
-        tops = torch.empty((len(queries), len(blocks)), device=queries.device)
+        blocks = self._coarse.split(self._block)
+        tops = torch.empty((len(blocks), len(queries)), device=queries.device)
         for number, block in enumerate(blocks):  # a list of small tensors between the large ones would fragment the memory
-            tops[:, number] = block_maxima(queries, block)
-        best = tops.amax(dim=1)
+            tops[number] = block_maxima(queries, block)
+        best = tops.amax(dim=0)
         least = best - margin(best, errors, self._dtype)  # (n,)
         rows, words = [], []
         for number, block in enumerate(blocks):
-            near = (tops[:, number] >= least).nonzero()[:, 0]
+            near = (tops[number] >= least).nonzero()[:, 0]
             if len(near):
                 row, word = (queries[near] @ block.T >= least[near, None]).nonzero(as_tuple=True)
                 rows.append(near[row])
-                words.append(word + number * BLOCK)
+                words.append(word + number * self._block)
         return torch.cat(rows).cpu().numpy(), torch.cat(words).cpu().numpy()
 
     def _decide(self, queries: Words | Floats, rows: np.ndarray, words: np.ndarray) -> np.ndarray:

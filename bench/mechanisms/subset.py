@@ -21,7 +21,7 @@ import math
 from decimal import MAX_EMAX, MIN_EMIN, ROUND_CEILING, ROUND_FLOOR, ROUND_HALF_EVEN, Context, Decimal
 from fractions import Fraction
 from functools import lru_cache
-from itertools import count
+from itertools import count, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -186,21 +186,23 @@ def _draw_one_by_one(true: Indices, included: NDArray[np.bool_], domain: int, si
         drawn = rng.integers(domain - 1, size=(size, len(true[rows])))  # (m, n) of the remaining |K| − 1
         drawn += drawn >= true[rows]
         np.copyto(drawn[0], true[rows], where=included[rows])
-        words[rows] = _sort_rows(drawn)
+        _sort_rows(drawn, words[rows])
     return words
 
 
-def _sort_rows(columns: Indices) -> Indices:
-    """Return the sorted rows of a matrix that is given by its columns. (m, n) -> (n, m)"""
+def _sort_rows(columns: Indices, rows: Indices) -> None:
+    """Write the sorted rows of a matrix that is given by its columns, which are overwritten. (m, n), (n, m)"""
     if len(columns) > 4:
-        rows = columns.T.copy()
+        rows[:] = columns.T
         rows.sort(axis=1)
-        return rows
+        return
     for last in range(len(columns) - 1, 0, -1):  # bubble sort: for such short rows, np.sort takes up to ten times as long
-        for i in range(last):
-            low, high = columns[i], columns[i + 1]
-            columns[i], columns[i + 1] = np.minimum(low, high), np.maximum(low, high)
-    return columns.T
+        for low, high in pairwise(columns[: last + 1]):
+            least = np.minimum(low, high)
+            np.maximum(low, high, out=high)
+            low[:] = least
+        rows[:, last] = columns[last]
+    rows[:, 0] = columns[0]
 
 
 def _find_repeating(rows: Indices) -> Indices:
