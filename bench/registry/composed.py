@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import TYPE_CHECKING
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from bench.codebook.public import Public
 
 # Declarations of the defense of descriptors that hold for both together.
-INHERITED = ("releases", "dictionary_field", "word_count_field", "noisy")
+INHERITED = ("releases", "supported_settings", "dictionary_field", "word_count_field", "noisy")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,7 +33,7 @@ class Composed(Defense):
     def __post_init__(self) -> None:
         for name in INHERITED:
             object.__setattr__(self, name, getattr(self.descriptors, name))
-        for field in (self.dictionary_field, self.word_count_field):
+        for field in (*self.supported_settings, self.dictionary_field, self.word_count_field):
             if field is not None:
                 object.__setattr__(self, field, getattr(self.descriptors, field))
         object.__setattr__(self, "positions", self.geometry.positions)
@@ -84,6 +84,13 @@ def compose(defenses: Sequence[Defense]) -> Composed:
 def hides_positions(defense: Defense) -> bool:
     """Return whether a defense hides positions and releases descriptors unchanged, so that it can be composed with another."""
     return defense.positions is not Points and issubclass(defense.releases, Descriptors)
+
+
+def configure(defense: Defense, settings: Mapping[str, object]) -> Defense:
+    """Return the defense with other settings; those of a composed one are settings of its defense of descriptors."""
+    if isinstance(defense, Composed):
+        return dataclasses.replace(defense, descriptors=configure(defense.descriptors, settings))
+    return dataclasses.replace(defense, **settings)  # type: ignore[type-var]  # plugins are dataclasses
 
 
 def list_parts(defense: Defense) -> tuple[Defense, ...]:
