@@ -1,9 +1,11 @@
 """Measures defenses that hide positions, alone and together with a descriptor defense, and writes docs/results/geometry.md.
 
-    python tools/measure_geometry.py --work work/geometry
+    python tools/measure_geometry.py --work work/geometry --scene fox/
 
 1. Attacks on positions, on the built-in photographs: the error of positions, and the image that follows.
-2. Localization from lines and from points in a small gallery, with the same keypoints and the same limit of trials.
+2. The attack of the server, on queries of a small gallery.
+3. Localization from lines and from points in the small gallery and in a photographed scene, with the same keypoints and the same
+   limit of trials.
 
 Records in WORK are reused, so an interrupted run resumes.
 """
@@ -31,18 +33,36 @@ the defenses and attacks. In brackets: 95% intervals of Student's t over photogr
 The settings of `neighbourhood` were chosen on other photographs. `dia` reconstructs the image from the recovered positions. Its
 network was trained on true positions and not on their errors, so the scores of images are lower bounds of the leakage.
 """
+ON_PHOTOGRAPHS = """## Attacks on positions
+
+*position error*: median distance of a photograph's keypoints to their recovered positions, in pixels.
+*identified*: [reciprocal rank](../method.md#identification) of the photograph among 256. Both: means over photographs.
+A random order has 0.024. The constant image of `blank` has rank 128.5, and so 0.008.
+"""
+BY_SERVER = f"""## Attack of the server
+
+Releases of the queries of the dataset `{SMALL_GALLERY}`, by the server that localizes them.
+"""
+LOCALIZATION = """## Localization
+
+A difference of one or two queries is no evidence. A query is *localized* if a pose was found. Columns with thresholds: fractions
+of all queries. Errors: medians over the localized ones. *matches* and *trials* (of RANSAC; 0 without a pose) are medians over all
+queries. The limit of trials is the same for all defenses.
+"""
 PLAIN = {"none": ("dia", "keypoints")}
 HIDDEN = ("lines", "permutation")
 ON_HIDDEN = ("neighbourhood-oracle", "neighbourhood", "density", "blank")
 COMPOSED = ("lines+ldp:epsilon=16", "lines+ldp:epsilon=10")
 ON_COMPOSED = ("neighbourhood-oracle", "neighbourhood")
 SHOWN = {"position-error": 1, "ssim": 3, "psnr": 2, "identified": 3}  # metric -> digits
-LOCALIZED = ("none", "lines", "permutation")
+SERVED = ("snap", "neighbourhood")
+LOCALIZED = ("none", "lines", "permutation", "ldp:epsilon=16", "lines+ldp:epsilon=16", "ldp:epsilon=10", "lines+ldp:epsilon=10")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--work", type=Path, required=True, help="folder of records, reused between runs")
+    parser.add_argument("--scene", type=Path, required=True, help="the photographs of the fox, the example scene of instant-ngp")
     args = parser.parse_args()
     args.work.mkdir(parents=True, exist_ok=True)
     pairs = [
@@ -50,39 +70,49 @@ def main() -> None:
         *((defense, attack) for defense in HIDDEN for attack in ON_HIDDEN),
         *((defense, attack) for defense in COMPOSED for attack in ON_COMPOSED),
     ]
+    in_gallery = {defense: localize(defense, SMALL_GALLERY, args.work / "localization") for defense in LOCALIZED}
+    served = {("lines", attack): attack_positions("lines", attack, args.work / "server", SMALL_GALLERY) for attack in SERVED}
+    photographed = f"captured:path={args.scene}"
+    in_scene = {defense: localize(defense, photographed, args.work / "scene") for defense in LOCALIZED}
     attacked = {pair: attack_positions(*pair, args.work / "attacks") for pair in pairs}
-    localized = {defense: localize(defense, args.work / "localization") for defense in LOCALIZED}
-    records = [record for some in (*attacked.values(), *localized.values()) for record in some]
-    parts = [TITLE, write_attacks(attacked), write_localization(localized)]
-    write_page("geometry.md", "\n".join(parts), records)
+    results = (attacked, served, in_gallery, in_scene)
+    parts = [
+        TITLE,
+        write_attacks(attacked, ON_PHOTOGRAPHS),
+        write_attacks(served, BY_SERVER),
+        LOCALIZATION,
+        write_localization(in_gallery, f"Dataset `{SMALL_GALLERY}`, a rendered building"),
+        write_localization(in_scene, "Dataset `captured:path=fox/`, a photographed scene; every fifth photograph is a query"),
+    ]
+    write_page("geometry.md", "\n".join(parts), [record for some in results for each in some.values() for record in each])
 
 
-def attack_positions(defense: str, attack: str, work: Path) -> list[Record]:
+def attack_positions(defense: str, attack: str, work: Path, dataset: str | None = None) -> list[Record]:
     """Return the records of one attack on one defense."""
     print(defense, attack, flush=True)
-    return bench.run([spec.read(defense, discovery.DEFENSE)], [spec.read(attack, discovery.ATTACK)], out=work)
+    return bench.run(
+        [spec.read(defense, discovery.DEFENSE)],
+        [spec.read(attack, discovery.ATTACK)],
+        dataset=None if dataset is None else spec.read(dataset, discovery.DATASET),
+        out=work,
+    )
 
 
-def localize(defense: str, work: Path) -> list[Record]:
+def localize(defense: str, dataset: str, work: Path) -> list[Record]:
     """Return the records of the localization of one defense's releases."""
     print("localization", defense, flush=True)
     return bench.run(
         [spec.read(defense, discovery.DEFENSE)],
         task=spec.read("localization", discovery.TASK),
-        dataset=spec.read(SMALL_GALLERY, discovery.DATASET),
+        dataset=spec.read(dataset, discovery.DATASET),
         out=work,
     )
 
 
-def write_attacks(results: Mapping[tuple[str, str], Sequence[Record]]) -> str:
-    """Write the table of attacks."""
+def write_attacks(results: Mapping[tuple[str, str], Sequence[Record]], heading: str) -> str:
+    """Write a table of attacks."""
     lines = [
-        "## Attacks on positions",
-        "",
-        "*position error*: median distance of a photograph's keypoints to their recovered positions, in pixels.",
-        "*identified*: [reciprocal rank](../method.md#identification) of the photograph among 256. Both: means over photographs.",
-        "A random order has 0.024. The constant image of `blank` has rank 128.5, and so 0.008.",
-        "",
+        heading,
         markdown_row(("defense", "attack", "position error", "SSIM", "PSNR", "identified")),
         markdown_row(["---"] * 6),
     ]
@@ -96,14 +126,10 @@ def write_attacks(results: Mapping[tuple[str, str], Sequence[Record]]) -> str:
     return "\n".join([*lines, ""])
 
 
-def write_localization(results: Mapping[str, Sequence[Record]]) -> str:
-    """Write the table of localization."""
+def write_localization(results: Mapping[str, Sequence[Record]], caption: str) -> str:
+    """Write the table of localization in one dataset."""
     lines = [
-        "## Localization",
-        "",
-        f"Dataset `{SMALL_GALLERY}`, a rendered building. A difference of one or two of its queries is no evidence.",
-        "A query is *localized* if a pose was found. Columns with thresholds: fractions of all queries. Errors: medians over",
-        "the localized ones. *matches* and *trials* (of RANSAC; 0 without a pose) are medians over all queries.",
+        f"{caption}:",
         "",
         markdown_row(
             ("defense", "queries", "localized", *RECALLS.values(), "error in m", "error in degrees", "matches", "trials")
