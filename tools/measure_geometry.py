@@ -1,4 +1,4 @@
-"""Measures defenses that hide positions, alone and together with a descriptor defense, and writes docs/results/geometry.md.
+"""Measures defenses that hide positions, alone and together with a descriptor defense, and writes docs/results/geometry.md and a plot.
 
     python tools/measure_geometry.py --work work/geometry --scene fox/
 
@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from result_page import RECALLS, SMALL_GALLERY, format_interval, list_values, write_page
@@ -24,6 +25,10 @@ from bench.core.table import markdown_row
 from bench.registry import discovery, spec
 from bench.runner.records import Record
 from leaderboard.intervals import interval
+from leaderboard.plot_style import choose_styles
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 TITLE = """# Defenses that hide positions
 
@@ -49,12 +54,16 @@ A difference of one or two queries is no evidence. A query is *localized* if a p
 of all queries. Errors: medians over the localized ones. *matches* and *trials* (of RANSAC; 0 without a pose) are medians over all
 queries. The limit of trials is the same for all defenses.
 """
-PLAIN = {"none": ("dia", "keypoints")}
+PLAIN = {"none": ("dia", "keypoints"), "ldp:epsilon=16": ("dia",), "ldp:epsilon=10": ("dia",)}
 HIDDEN = ("lines", "permutation")
-ON_HIDDEN = ("neighbourhood-oracle", "neighbourhood", "density", "blank")
+ON_HIDDEN = ("neighbourhood-oracle", "neighbourhood", "dia-lines", "density", "blank")
 COMPOSED = ("lines+ldp:epsilon=16", "lines+ldp:epsilon=10")
 ON_COMPOSED = ("neighbourhood-oracle", "neighbourhood")
 SHOWN = {"position-error": 1, "ssim": 3, "psnr": 2, "identified": 3}  # metric -> digits
+REFERENCES = ("neighbourhood-oracle", "blank", "keypoints")  # no attacks, or baselines
+FAMILIES = {"none": "nothing", "ldp": "descriptors", "lines": "positions", "permutation": "positions", "lines+ldp": "both"}
+RECALL = "recall_0.5m_5deg"  # of the plot
+PICTURE = Path(__file__).parents[1] / "docs" / "images" / "geometry.png"
 SERVED = ("snap", "neighbourhood")
 LOCALIZED = ("none", "lines", "permutation", "ldp:epsilon=16", "lines+ldp:epsilon=16", "ldp:epsilon=10", "lines+ldp:epsilon=10")
 
@@ -75,6 +84,7 @@ def main() -> None:
     photographed = f"captured:path={args.scene}"
     in_scene = {defense: localize(defense, photographed, args.work / "scene") for defense in LOCALIZED}
     attacked = {pair: attack_positions(*pair, args.work / "attacks") for pair in pairs}
+    draw_tradeoff(attacked, in_gallery).savefig(PICTURE, dpi=110)
     results = (attacked, served, in_gallery, in_scene)
     parts = [
         TITLE,
@@ -107,6 +117,33 @@ def localize(defense: str, dataset: str, work: Path) -> list[Record]:
         dataset=spec.read(dataset, discovery.DATASET),
         out=work,
     )
+
+
+def draw_tradeoff(attacked: Mapping[tuple[str, str], Sequence[Record]], localized: Mapping[str, Sequence[Record]]) -> Figure:
+    """Draw the score of the strongest attack on each defense over the recall of localization, for two scores."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9.0, 3.8), layout="constrained")
+    styles = choose_styles(FAMILIES.values())
+    for axes, (metric, label) in zip(figure.subplots(1, 2), {"ssim": "SSIM", "identified": "identified"}.items(), strict=True):
+        for defense, records in localized.items():
+            attacks = {attack: each for (one, attack), each in attacked.items() if one == defense and attack not in REFERENCES}
+            score = max(values.mean() for each in attacks.values() if len(values := list_values(each, metric)))
+            recall = list_values(records, RECALL).mean()
+            style = styles[FAMILIES[defense.partition(":")[0]]]
+            axes.plot(recall, score, style.marker, color=style.colour, ms=7, clip_on=False)
+            axes.annotate(defense.replace(":epsilon=", ", ε = "), (recall, score), (6, 5), textcoords="offset points", fontsize=7)
+        blank = list_values(attacked["lines", "blank"], metric).mean()
+        axes.axhline(blank, color="0.35", lw=1, label="baseline blank")
+        axes.set_xlabel("localization within 0.5 m, 5°: fraction of queries →", fontsize=9)
+        axes.set_ylabel(f"{label} of the strongest attack →", fontsize=9)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.tick_params(labelsize=8)
+        axes.margins(x=0.25, y=0.12)
+    for family, style in styles.items():
+        axes.plot([], [], style.marker, color=style.colour, label=f"hides {family}")
+    figure.legend(*axes.get_legend_handles_labels(), fontsize=8, frameon=False, loc="outside lower center", ncols=5)
+    return figure
 
 
 def write_attacks(results: Mapping[tuple[str, str], Sequence[Record]], heading: str) -> str:

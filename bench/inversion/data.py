@@ -181,7 +181,7 @@ def quantise(
     total = len(sizes) * sum(len(view.features) for view in views)
     with Progress("quantising", total) as progress:
         for asset in sorted(set(dictionaries.values())):
-            rows = np.concatenate([select_rows(view.features) for view in views if dictionaries[view.photograph] == asset])
+            rows = np.concatenate([view.features.exact for view in views if dictionaries[view.photograph] == asset])
             keys, first = _find_first_occurrences(hash_rows(rows))
             words = np.full(len(first), np.iinfo(np.int64).max)  # no word is known yet
             for size in sizes:
@@ -198,11 +198,6 @@ def _find_first_occurrences(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the distinct keys, ascending, and the first index of each."""
     distinct, first = np.unique(keys, return_index=True)
     return distinct, first
-
-
-def select_rows(features: Features) -> Bytes | Floats:
-    """Return the rows to quantise: the 8-bit vectors if there are any, else the descriptors."""
-    return features.descriptors if features.codes is None else features.codes
 
 
 def measure_quantisation_error(

@@ -48,7 +48,7 @@ from bench.inversion.process_group import ProcessGroup, launch
 from bench.inversion.reconstruct import infer, locate_keypoints
 from bench.inversion.symmetry import IDENTITY, POSITION_SYMMETRIES, find_symmetries
 from bench.settings import Asset, OneOf
-from bench.types import Lines, Subspaces, WordSets
+from bench.types import Subspaces, WordSets
 
 CHECKPOINT = "inversion-checkpoint"
 CHECKPOINT_EVERY = 250  # steps
@@ -192,7 +192,7 @@ def _count_samples(targets: Sequence[Target], encoding: Encoding) -> int:
     UserError
         if only some targets release lines, or the encoding is not "invariant".
     """
-    hidden = {issubclass(target.defense.positions, Lines) for target in targets}
+    hidden = {target.defense.hides_positions() for target in targets}
     if len(hidden) > 1:
         raise UserError("--defense: a network for lines reads no points; train another network for the other defenses")
     if hidden == {True} and encoding != "invariant":

@@ -12,7 +12,7 @@ import numpy as np
 
 from bench.api import Defense, Privacy
 from bench.core.errors import UserError
-from bench.types import Descriptors, Features, Points, Release
+from bench.types import Descriptors, Features, Release
 
 if TYPE_CHECKING:
     from bench.codebook.public import Public
@@ -72,8 +72,8 @@ def compose(defenses: Sequence[Defense]) -> Composed:
         unless one hides positions and the other does not.
     """
     names = "+".join(defense.name() for defense in defenses)
-    geometry = [defense for defense in defenses if hides_positions(defense)]
-    others = [defense for defense in defenses if not hides_positions(defense)]
+    geometry = [defense for defense in defenses if hides_positions_alone(defense)]
+    others = [defense for defense in defenses if not hides_positions_alone(defense)]
     for kind, same in (("positions", geometry), ("descriptors", others)):
         if len(same) > 1:
             doubled = " and ".join(defense.name() for defense in same)
@@ -81,9 +81,9 @@ def compose(defenses: Sequence[Defense]) -> Composed:
     return Composed(geometry=geometry[0], descriptors=others[0])
 
 
-def hides_positions(defense: Defense) -> bool:
+def hides_positions_alone(defense: Defense) -> bool:
     """Return whether a defense hides positions and releases descriptors unchanged, so that it can be composed with another."""
-    return defense.positions is not Points and issubclass(defense.releases, Descriptors)
+    return defense.hides_positions() and issubclass(defense.releases, Descriptors)
 
 
 def configure(defense: Defense, settings: Mapping[str, object]) -> Defense:

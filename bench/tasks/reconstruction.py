@@ -63,7 +63,7 @@ class Reconstruction(Task):
         served: set[type[Knowledge]] = {ServerMap} if public.scene_index is not None else set()
         if defense.dictionary_field is not None and issubclass(defense.releases, WordSets):
             served.add(TrueWords)
-        if not issubclass(defense.positions, Points):
+        if defense.hides_positions():
             served.add(TrueNeighbours)
         missing = attack.needs - offer_knowledge(attack, defense, public).keys() - RELEASES - served
         if missing:
