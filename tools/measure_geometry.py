@@ -1,4 +1,4 @@
-"""Measures defenses that hide positions, alone and together with a descriptor defense, and writes docs/results/geometry.md and a plot.
+"""Measures defenses that hide positions, alone and with a descriptor defense, and writes docs/results/geometry.md and a plot.
 
     python tools/measure_geometry.py --work work/geometry --scene fox/
 
