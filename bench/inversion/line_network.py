@@ -58,8 +58,8 @@ class LineInverter(nn.Module):
         middle = lines.samples[:, samples // 2 :][:, :1]
         hidden = self.inverter.embed_points(lines.pick_points(middle, torch.ones_like(middle[:, :, 0])))  # (P, hidden)
         logs = torch.zeros(count, samples, device=hidden.device).log_softmax(dim=1)
-        for number in self.rounds:
-            scores, field = number(hidden, logs, lines)
+        for update in self.rounds:
+            scores, field = update(hidden, logs, lines)
             logs = (logs + scores.float()).log_softmax(dim=1)
         best, indices = logs.topk(min(PEAKS, samples), dim=1)  # (P, k) twice
         weights = best.exp() * self.weigh(torch.stack([best, best.exp()], dim=2))[:, :, 0].float().clamp(-3, 3).exp()
