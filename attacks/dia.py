@@ -31,7 +31,7 @@ from bench.codebook.public import ASSETS, Public
 from bench.context import weights as context
 from bench.core.errors import UserError
 from bench.inversion.symmetry import Symmetry, find_symmetries
-from bench.inversion.weights import Network, explain_incompatible, list_defenses, load
+from bench.inversion.weights import Network, find_network, load
 from bench.settings import Asset
 from bench.threat_model import PublicAssets
 from bench.types import Descriptors, Floats, Release, Subspaces, WordSets
@@ -84,8 +84,9 @@ def _weigh_and_reconstruct(
     """Reconstruct with the posteriors of the context model that the network was trained with."""
     from bench.context.encoding import prior_odds
     from bench.context.reconstruct import reconstruct_from_posteriors
+    from bench.inversion.network import Inverter
 
-    if not isinstance(release, WordSets):
+    if not isinstance(release, WordSets) or not isinstance(network.module, Inverter):
         raise TypeError(f"{network.path} reads WordSets, got {type(release).__name__}")
     odds = prior_odds(defense, public, release.subset_size)
     return reconstruct_from_posteriors(network.module, _load_context(network).module, release, odds, symmetries)
@@ -107,16 +108,9 @@ def _load_context(network: Network) -> context.Network:
 
 def _choose(asset: str, defense: Defense, extractor: Extractor, public: Public) -> tuple[Path | None, str | None]:
     """Return the path of the weights for these releases, or the reason why there are none."""
-    candidates = sorted(ASSETS.glob(SHIPPED[asset])) if asset in SHIPPED else [Path(asset)]
-    reasons = []
-    for path in candidates:
-        meta = load(path).meta
-        reason = explain_incompatible(meta, defense, extractor, public)
-        if reason is None:
-            return path, None
-        if asset not in SHIPPED or defense.name() in list_defenses(meta):
-            reasons.append(f"{path.name} was {reason}")
-    details = f" ({'; '.join(reasons)})" if reasons else ""
+    path, details = find_network(asset, SHIPPED, defense, extractor, public)
+    if path is not None:
+        return path, None
     command = "bench train --encoding released" if asset == "shipped-as-printed" else "bench train"
     return None, f"no adapted attacker{details}; train one with `{command}` and pass dia:weights=FILE"
 

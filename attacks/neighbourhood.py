@@ -44,7 +44,7 @@ class Neighbourhood(PositionAttack):
     reach: float = 15.0  # pixels; a line farther away than this costs no more than one at this distance; tuned on tune.txt
 
     def explain_incompatible(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
-        return neighbour_model.load().explain_other_features(extractor)
+        return neighbour_model.load().explain_other_features(extractor, public)
 
     def assets(self, defense: Defense, extractor: Extractor, public: Public) -> Mapping[str, str]:
         return {"neighbour_model": neighbour_model.load().digest}

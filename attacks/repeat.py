@@ -9,7 +9,8 @@ Method:
 
 Knowledge: `releases` - 1 further releases of the same photograph.
 
-Limits: T releases of an ε-LDP defense are T ε-LDP, so the attack on word sets is bounded by T ε.
+Limits: T releases of an ε-LDP defense are T ε-LDP, so the attack on word sets is bounded by T ε. The attack does not apply to
+defenses that hide positions, because they hide the order of the keypoints, too.
 """
 
 from __future__ import annotations
@@ -19,12 +20,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.api import DescriptorAttack, View
+from bench.api import Defense, DescriptorAttack, Extractor, View
+from bench.codebook.public import Public
 from bench.core.errors import UserError
 from bench.geometry.metric_inputs import normalize_rows
 from bench.mechanisms.multi_release import find_common_points, select_likeliest
 from bench.threat_model import RepeatedReleases
-from bench.types import Floats, Indices, Release, Subspaces, WordSets
+from bench.types import Floats, Indices, Positions, Release, Subspaces, WordSets
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,6 +34,7 @@ class Repeat(DescriptorAttack):
     """Estimates the descriptor by the intersection of a keypoint's subspaces, or by the word in most of its sets."""
 
     accepts = (Subspaces, WordSets)
+    accepts_positions = (Positions,)
     needs = frozenset({RepeatedReleases})
 
     releases: int = 2  # number of releases of the same features, including the first
@@ -39,6 +42,11 @@ class Repeat(DescriptorAttack):
     def __post_init__(self) -> None:
         if self.releases < 1:
             raise UserError(f"repeat: releases must be at least 1, got {self.releases}")
+
+    def explain_incompatible(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
+        if defense.hides_positions():
+            return f"repeat needs the keypoints of all releases in one order; each release of {defense.name()} has a random order"
+        return None
 
     def repeats(self) -> int:
         return self.releases - 1

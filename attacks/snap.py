@@ -46,7 +46,7 @@ class Snap(PositionAttack):
     trials: int = 30_000  # maximum number of RANSAC's trials
 
     def explain_incompatible(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
-        return neighbour_model.load().explain_other_features(extractor)
+        return neighbour_model.load().explain_other_features(extractor, public)
 
     def assets(self, defense: Defense, extractor: Extractor, public: Public) -> Mapping[str, str]:
         return {"neighbour_model": neighbour_model.load().digest}

@@ -83,6 +83,10 @@ class Defense(Plugin, ABC):
         """
         return Fraction(int(one != other))
 
+    def hides_positions(self) -> bool:
+        """Return whether the release has other positions than the keypoints in the clear."""
+        return not issubclass(self.positions, Points)
+
     def is_memoized(self) -> bool:
         """Return whether a device always gives the same answer for equal descriptors.
 

@@ -138,19 +138,20 @@ def _check_attack(
         others=draw_others,
         repeats=tuple(defense.protect(mine, public, np.random.default_rng([2, number])) for number in range(attack.repeats())),
     )
-    estimate = _estimate(trial)
-    if isinstance(attack, DescriptorAttack):
-        _require(estimate.shape == secret.descriptors.shape, "the result has another shape than the descriptors of the secret")
-    elif isinstance(attack, ImageAttack):
-        _require(estimate.shape == (*secret.size[::-1], 3), "the result has another size than the photograph")
-        _require(estimate.min() >= 0, "the result has values below 0")
-        _require(estimate.max() <= 1, "the result has values above 1")
-    elif isinstance(attack, PositionAttack):
-        _require(estimate.shape == secret.keypoints.shape, "the result has another shape than the keypoints of the secret")
-        _require(np.isfinite(estimate).all(), "the result has values that are not finite")
-    if not isinstance(attack, (ImageAttack, PositionAttack)):
-        np.testing.assert_allclose(np.linalg.norm(estimate, axis=1), 1, atol=TOLERANCE)
-    _require(estimate.dtype == np.float32, "the result is not float32")
+    estimates = _estimate(trial)
+    for kind, estimate in estimates.items():
+        if kind is DescriptorAttack:
+            _require(estimate.shape == secret.descriptors.shape, "the result has another shape than the secret descriptors")
+        elif kind is ImageAttack:
+            _require(estimate.shape == (*secret.size[::-1], 3), "the result has another size than the photograph")
+            _require(estimate.min() >= 0, "the result has values below 0")
+            _require(estimate.max() <= 1, "the result has values above 1")
+        elif kind is PositionAttack:
+            _require(estimate.shape == secret.keypoints.shape, "the result has another shape than the keypoints of the secret")
+            _require(np.isfinite(estimate).all(), "the result has values that are not finite")
+        if kind in (DescriptorAttack, SelectiveAttack):
+            np.testing.assert_allclose(np.linalg.norm(estimate, axis=1), 1, atol=TOLERANCE)
+        _require(estimate.dtype == np.float32, "the result is not float32")
     if not attack.needs.isdisjoint((TrueWords, TrueNeighbours)):
         return  # an oracle reads a part of the secret, by declaration
     for array in (*_arrays(mine), *quantised):
@@ -159,7 +160,8 @@ def _check_attack(
         if entry.kind not in (maps.KIND, dictionary.KIND):  # these two hold public data alone
             overwrite_with_zeros(entry.path, entry.kind)
     public.clear()
-    _require(np.array_equal(estimate, _estimate(trial)), "the attack saw more than the release")
+    again = _estimate(trial)
+    _require(all(np.array_equal(estimates[kind], again[kind]) for kind in estimates), "the attack saw more than the release")
 
 
 def check_metric(metric: Metric, seed: int = 0) -> None:
@@ -302,18 +304,20 @@ def arrays_equal(one: np.ndarray, other: np.ndarray) -> bool:
     return one.dtype == other.dtype and np.array_equal(one, other)
 
 
-def _estimate(trial: Trial) -> Floats:
-    """Return the result of the attack: an image, or descriptors of all or of the selected keypoints."""
-    view, rng = build_view(trial), np.random.default_rng(3)
-    if isinstance(trial.attack, DescriptorAttack):
-        return trial.attack.recover(view, rng)
-    if isinstance(trial.attack, SelectiveAttack):
-        return trial.attack.select(view, rng).descriptors
-    if isinstance(trial.attack, ImageAttack):
-        return trial.attack.reconstruct(view, rng)
-    if isinstance(trial.attack, PositionAttack):
-        return trial.attack.locate(view, rng)
-    raise AssertionError("the attack recovers neither descriptors nor images")
+def _estimate(trial: Trial) -> dict[type[Attack], Floats]:
+    """Return the results of the attack by its classes: an attack may locate keypoints and reconstruct the image."""
+    attack = trial.attack
+    estimates: dict[type[Attack], Floats] = {}
+    if isinstance(attack, DescriptorAttack):
+        estimates[DescriptorAttack] = attack.recover(build_view(trial), np.random.default_rng(3))
+    if isinstance(attack, SelectiveAttack):
+        estimates[SelectiveAttack] = attack.select(build_view(trial), np.random.default_rng(3)).descriptors
+    if isinstance(attack, ImageAttack):
+        estimates[ImageAttack] = attack.reconstruct(build_view(trial), np.random.default_rng(3))
+    if isinstance(attack, PositionAttack):
+        estimates[PositionAttack] = attack.locate(build_view(trial), np.random.default_rng(3))
+    _require(estimates, "the attack recovers neither descriptors nor images nor positions")
+    return estimates
 
 
 def _arrays(value: Any) -> list[np.ndarray]:

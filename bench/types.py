@@ -31,6 +31,11 @@ class Features:
     def __len__(self) -> int:
         return len(self.keypoints)
 
+    @property
+    def exact(self) -> Bytes | Floats:
+        """The 8-bit vectors if there are any, else the descriptors. (N, D)"""
+        return self.descriptors if self.codes is None else self.codes
+
     def by_position(self) -> Features:
         """Return the same features from top to bottom, then from left to right.
 

@@ -70,7 +70,7 @@ class Affine(Lifting):
         length = secret.descriptors.shape[1]
         if self.dim >= length:
             raise UserError(f"affine: dim must be below the descriptors' length, {length}, got {self.dim}")
-        first, words = self._draw_sub_database(secret.descriptors, public, rng)
+        first, words = self._draw_sub_database(secret, public, rng)
         d = secret.descriptors.astype(np.float64)  # (N, D)
         span, indices = lift(d, words, self.adversarial, self.dim, rng)  # (N, dim, D), (N, adversarial)
         origins, bases = reparameterise(d, span, rng)
@@ -80,12 +80,12 @@ class Affine(Lifting):
     def privacy(self, public: Public) -> Privacy:
         return Privacy("none")
 
-    def _draw_sub_database(self, descriptors: Floats, public: Public, rng: np.random.Generator) -> tuple[int, Words]:
+    def _draw_sub_database(self, secret: Features, public: Public, rng: np.random.Generator) -> tuple[int, Words]:
         """Draw the sub-database of a photograph. Returns its first row in the database, and its words (S, D)."""
         if self.adversarial == 0:
-            return 0, np.empty((0, descriptors.shape[1]), dtype=np.uint8)
+            return 0, np.empty((0, secret.descriptors.shape[1]), dtype=np.uint8)
         database = public.dictionary(self.database)
-        database.check_suits(descriptors, self.database)
+        database.check_suits(secret.exact, self.database)
         smallest = len(database) // self.sub_databases
         if smallest < self.adversarial:
             raise UserError(

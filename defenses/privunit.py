@@ -45,7 +45,7 @@ from bench.core.errors import UserError
 from bench.geometry.nearest_words import unit_rows
 from bench.mechanisms.subset import draw_inclusion
 from bench.settings import Asset, Between, OneOf
-from bench.types import Descriptors, Features, Floats, Points
+from bench.types import Descriptors, Features, Points
 
 Doubles = NDArray[np.float64]
 
@@ -70,7 +70,7 @@ class PrivUnit(Defense):
             raise UserError(f"privunit: epsilon must be above 0 and finite, got {self.epsilon}")
 
     def protect(self, secret: Features, public: Public, rng: np.random.Generator) -> Descriptors:
-        mean = self._load_mean(secret.descriptors, public)
+        mean = self._load_mean(secret, public)
         vectors = draw_near(remove_mean(secret.descriptors.astype(np.float64), mean), mean, self.epsilon, rng)
         released = unit_rows((np.rint(vectors / GRID) * GRID).astype(np.float32))
         return Descriptors(positions=Points(keypoints=secret.keypoints.copy()), size=secret.size, descriptors=released)
@@ -78,12 +78,12 @@ class PrivUnit(Defense):
     def privacy(self, public: Public) -> Privacy:
         return Privacy("epsilon-ldp", self.epsilon)
 
-    def _load_mean(self, descriptors: Floats, public: Public) -> Doubles | None:
+    def _load_mean(self, secret: Features, public: Public) -> Doubles | None:
         """Return the mean direction to remove, (1, D); None if it is not removed."""
         if not self.centred:
             return None
         dictionary = public.dictionary(self.dictionary)
-        dictionary.check_suits(descriptors, self.dictionary)
+        dictionary.check_suits(secret.exact, self.dictionary)
         return dictionary.mean[None]
 
 

@@ -73,7 +73,7 @@ ALLOWED: dict[tuple[str, str], str] = {
         r"bench/(api|audit/|datasets/|images/|positions/|registry/).*|(leaderboard|metrics|tests|tools)/.*",
         r"unit",
     ): "units of measure",
-    (r"bench/inversion/network\.py|tests/inversion/.*", r"paint|painted"): "names of tensors and metadata in shipped networks",
+    (r"bench/inversion/(line_)?network\.py|tests/inversion/.*", r"paint|painted"): "names in shipped networks",
     (r"defenses/privunit\.py|tests/.*|docs/.*", r"PrivUnit"): "the name of a mechanism",
     (r"bench/formats/published\.py|tests/.*", r"(?i:places365)"): "the name of a dataset",
     (r"bench/rendering/.*", r"legs?|board"): "parts of people and furniture",

@@ -22,6 +22,7 @@ from bench.images import photographs
 from bench.images.photographs import Source
 from bench.positions import neighbour_model
 from bench.positions.neighbour_model import KIND, NeighbourModel
+from bench.registry import spec
 from bench.types import Features
 
 NEAR = 12.0  # pixels: keypoints that are closer are neighbours
@@ -60,7 +61,7 @@ def main() -> None:
     print(f"{len(secrets)} photographs read in {time.monotonic() - started:.0f} s", flush=True)
     module = fit(secrets, args.steps)
     meta = {
-        "extractor": "sift",
+        "extractor": spec.to_json(Sift()),
         "photographs": sorted(each.content_hash() for each in training),
         "near": NEAR,
         "steps": args.steps,

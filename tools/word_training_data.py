@@ -27,7 +27,7 @@ from bench.extractors.sift import Sift
 from bench.identification.thumbnails import Doubles
 from bench.images.photographs import SIDE, Source, crop_square, decode
 from bench.images.views import PhotographView
-from bench.inversion.data import check_dictionary_sizes, quantise, select_rows
+from bench.inversion.data import check_dictionary_sizes, quantise
 from bench.inversion.encoding import CELL, EncodedRelease
 from bench.inversion.symmetry import find_symmetries
 from bench.mechanisms.subset import log10_chance
@@ -148,7 +148,7 @@ def _look_up(
         nearest = []
         for view in views:
             asset = assigned[view.photograph]
-            nearest.append(quantisation(public.dictionary(asset, size), select_rows(view.features)) + rows[asset])
+            nearest.append(quantisation(public.dictionary(asset, size), view.features.exact) + rows[asset])
         used = size or len(table) // len(assets)
         found.append(Words(table, used, first, torch.from_numpy(np.concatenate(nearest)).to(device)))
     return found

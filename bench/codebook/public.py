@@ -110,7 +110,7 @@ class Public:
             if the words cannot stand for the descriptors.
         """
         chosen = self.dictionary(asset, words)
-        queries = features.descriptors if features.codes is None else features.codes
+        queries = features.exact
         chosen.check_suits(queries, asset)
         if not self._cache_size:
             return self._quantiser(chosen, queries)

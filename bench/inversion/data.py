@@ -25,6 +25,7 @@ from bench.images.photographs import SIDE
 from bench.images.views import PhotographView
 from bench.inversion.encoding import encode_settings
 from bench.inversion.symmetry import IDENTITY, Symmetry
+from bench.registry.composed import configure
 from bench.settings import Asset, Between, OneOf
 from bench.types import Bytes, Features, Floats, Indices, Release
 
@@ -46,6 +47,7 @@ class Example:
     pixels: Bytes  # (256, 256, 3)
     release: Release
     settings: Floats  # (C,)
+    keypoints: Floats  # (N, 2) the true ones, which the release may hide
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,8 +76,12 @@ class Examples:
             raise UserError("none of 100 randomly drawn photographs could be read; check --images")
         example = self._release(view.photograph, *draw_crop(view, rng), rng)
         symmetry = self.symmetries[int(rng.integers(len(self.symmetries)))]
-        pixels, release = symmetry.transform_image(example.pixels), symmetry.transform_release(example.release)
-        return dataclasses.replace(example, pixels=pixels, release=release)
+        return dataclasses.replace(
+            example,
+            pixels=symmetry.transform_image(example.pixels),
+            release=symmetry.transform_release(example.release),
+            keypoints=symmetry.transform_points(example.keypoints, example.release.size),
+        )
 
     def release_view(self, view: PhotographView, rng: np.random.Generator) -> Example:
         """Return a whole view of 256 x 256 pixels and its release, for a random target with random supported settings."""
@@ -87,9 +93,9 @@ class Examples:
         settings: dict[str, object] = {field: setting.sample(rng) for field, setting in target.supported_settings.items()}
         if target.defense.dictionary_field is not None:
             settings[target.defense.dictionary_field] = self.dictionaries[photograph]
-        defense = dataclasses.replace(target.defense, **settings)  # type: ignore[type-var]  # plugins are dataclasses
+        defense = configure(target.defense, settings)
         condition = encode_settings(defense, number, [target.supported_settings for target in self.targets])
-        return Example(pixels, defense.protect(secret, self.public, rng), condition)
+        return Example(pixels, defense.protect(secret, self.public, rng), condition, secret.keypoints)
 
 
 def draw_crop(view: PhotographView, rng: np.random.Generator) -> tuple[Bytes, Features]:
@@ -175,7 +181,7 @@ def quantise(
     total = len(sizes) * sum(len(view.features) for view in views)
     with Progress("quantising", total) as progress:
         for asset in sorted(set(dictionaries.values())):
-            rows = np.concatenate([select_rows(view.features) for view in views if dictionaries[view.photograph] == asset])
+            rows = np.concatenate([view.features.exact for view in views if dictionaries[view.photograph] == asset])
             keys, first = _find_first_occurrences(hash_rows(rows))
             words = np.full(len(first), np.iinfo(np.int64).max)  # no word is known yet
             for size in sizes:
@@ -192,11 +198,6 @@ def _find_first_occurrences(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the distinct keys, ascending, and the first index of each."""
     distinct, first = np.unique(keys, return_index=True)
     return distinct, first
-
-
-def select_rows(features: Features) -> Bytes | Floats:
-    """Return the rows to quantise: the 8-bit vectors if there are any, else the descriptors."""
-    return features.descriptors if features.codes is None else features.codes
 
 
 def measure_quantisation_error(

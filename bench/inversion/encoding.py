@@ -8,15 +8,16 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import singledispatch
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from bench.api import Defense
+from bench.geometry.lines import clip_lines
 from bench.settings import Between, OneOf
-from bench.types import Descriptors, Floats, Release, Subspaces, WordSets
+from bench.types import Descriptors, Floats, Lines, Release, Subspaces, WordSets
 
 if TYPE_CHECKING:
     import torch
@@ -36,6 +37,7 @@ class EncodedRelease:
     image: Tensor  # (P,) int64, index in the batch
     batch: int  # B
     size: tuple[int, int]  # H, W in pixels
+    weights: Tensor | None = None  # (P,) of each keypoint's embedding; None: 1
 
     @property
     def grid(self) -> tuple[int, int]:
@@ -43,7 +45,42 @@ class EncodedRelease:
         return math.ceil(self.size[0] / CELL), math.ceil(self.size[1] / CELL)
 
     def to(self, device: torch.device) -> EncodedRelease:
-        return EncodedRelease(self.values.to(device), self.coordinates.to(device), self.image.to(device), self.batch, self.size)
+        moved = {name: value.to(device) for name, value in vars(self).items() if hasattr(value, "to")}
+        return replace(self, **moved)
+
+
+@dataclass(frozen=True, eq=False)
+class EncodedLines:
+    """The lines of a batch of B releases, P in all."""
+
+    values: Tensor  # (P, F) float32, with zeros for the position within the cell
+    samples: Tensor  # (P, S, 2) float32, column and row in cells of points on each line
+    image: Tensor  # (P,) int64, index in the batch
+    truth: Tensor | None  # (P,) int64, the sample that is nearest to the keypoint; None outside training
+    within: int  # column of `values` where the position within the cell starts
+    batch: int  # B
+    size: tuple[int, int]  # H, W in pixels
+
+    @property
+    def grid(self) -> tuple[int, int]:
+        """Rows and columns of cells, as of `EncodedRelease`."""
+        return math.ceil(self.size[0] / CELL), math.ceil(self.size[1] / CELL)
+
+    def to(self, device: torch.device) -> EncodedLines:
+        moved = {name: value.to(device) for name, value in vars(self).items() if hasattr(value, "to")}
+        return replace(self, **moved)
+
+    def pick_points(self, coordinates: Tensor, weights: Tensor) -> EncodedRelease:
+        """Return k keypoints of each line at (P, k, 2) cells, with (P, k) weights."""
+        points = coordinates.flatten(0, 1)
+        values = self.values.repeat_interleave(coordinates.shape[1], dim=0)
+        within = slice(self.within, self.within + 2)
+        values[:, within] = points - points.floor() - 0.5
+        image = self.image.repeat_interleave(coordinates.shape[1])
+        return EncodedRelease(values, points, image, self.batch, self.size, weights.flatten())
+
+
+Encoded = EncodedRelease | EncodedLines
 
 
 # Network input for a keypoint. "released": the unchanged release, stacked as in the paper (m words in order, or a random origin
@@ -148,22 +185,81 @@ def encode(releases: list[Release], settings: list[Floats], slots: int, encoding
     width, height = releases[0].size
     values, coordinates, image = [], [], []
     for number, (release, condition) in enumerate(zip(releases, settings, strict=True)):
-        stacked = stack(release, encoding)  # (N, s, D)
-        count, used, length = stacked.shape
-        if used > slots:
-            raise ValueError(f"{used} candidates per keypoint, but the network was trained for at most {slots}")
-        candidates = np.zeros((count, slots * length), dtype=np.float32)
-        # Unit rows of length D, scaled so that an element is about 1.
-        candidates[:, : used * length] = stacked.reshape(count, used * length) * np.float32(length**0.5)
         inside = np.clip(release.keypoints, 0, np.array([width, height]) * (1 - 1e-6))
         position = (inside / CELL).astype(np.float32)  # (N, 2)
         within = position - np.floor(position) - 0.5
-        repeated = np.broadcast_to(condition, (count, len(condition)))
-        values.append(np.concatenate([candidates, within, _encode_frames(release), repeated], axis=1, dtype=np.float32))
+        values.append(_encode_rows(release, condition, within, slots, encoding))
         coordinates.append(position)
-        image.append(np.full(count, number))
+        image.append(np.full(len(release), number))
     rows, cells, index = (torch.from_numpy(np.concatenate(parts)) for parts in (values, coordinates, image))
     return EncodedRelease(rows, cells, index, len(releases), (height, width))
+
+
+def encode_lines(
+    releases: Sequence[Release],
+    settings: Sequence[Floats],
+    slots: int,
+    encoding: Encoding,
+    samples: int,
+    keypoints: Sequence[Floats] | None = None,
+) -> EncodedLines:
+    """Encode a batch of releases of lines, with that many samples of each line. `keypoints` are the true ones, for training.
+
+    Rows are those of `encode`, with zeros for the position within the cell.
+
+    Raises
+    ------
+    ValueError
+        if a release has more candidates per keypoint than `slots`.
+    """
+    import torch
+
+    width, height = releases[0].size
+    values, points, image, truth = [], [], [], []
+    for number, (release, condition) in enumerate(zip(releases, settings, strict=True)):
+        values.append(_encode_rows(release, condition, np.zeros((len(release), 2), np.float32), slots, encoding))
+        points.append(sample_lines(release, samples))
+        image.append(np.full(len(release), number))
+        if keypoints is not None:
+            truth.append(np.linalg.norm(points[-1] - keypoints[number][:, None], axis=2).argmin(axis=1))
+    limit = np.array([width, height]) * (1 - 1e-6)
+    cells = (np.clip(np.concatenate(points), 0, limit) / CELL).astype(np.float32)
+    within = values[0].shape[1] - len(settings[0]) - _encode_frames(releases[0]).shape[1] - 2
+    return EncodedLines(
+        torch.from_numpy(np.concatenate(values)),
+        torch.from_numpy(cells),
+        torch.from_numpy(np.concatenate(image)),
+        torch.from_numpy(np.concatenate(truth)) if truth else None,
+        within,
+        len(releases),
+        (height, width),
+    )
+
+
+def sample_lines(release: Release, count: int) -> Floats:
+    """Return that many points on the part of each line in the image, equally far from each other. -> (N, count, 2) pixels
+
+    Raises
+    ------
+    TypeError
+        if the release holds other positions.
+    """
+    if not isinstance(release.positions, Lines):
+        raise TypeError(f"expected Lines, got {type(release.positions).__name__}")
+    return clip_lines(release.positions.lines, release.size).sample(count)
+
+
+def _encode_rows(release: Release, condition: Floats, within: Floats, slots: int, encoding: Encoding) -> Floats:
+    """Return the row of each keypoint. -> (N, F)"""
+    stacked = stack(release, encoding)  # (N, s, D)
+    count, used, length = stacked.shape
+    if used > slots:
+        raise ValueError(f"{used} candidates per keypoint, but the network was trained for at most {slots}")
+    candidates = np.zeros((count, slots * length), dtype=np.float32)
+    # Unit rows of length D, scaled so that an element is about 1.
+    candidates[:, : used * length] = stacked.reshape(count, used * length) * np.float32(length**0.5)
+    repeated = np.broadcast_to(condition, (count, len(condition)))
+    return np.concatenate([candidates, within, _encode_frames(release), repeated], axis=1, dtype=np.float32)
 
 
 def _encode_frames(release: Release) -> Floats:

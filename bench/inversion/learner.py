@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import torch
 from torch import Tensor, nn
 
 from bench.core.device import pick_device, pick_dtype
-from bench.inversion.encoding import EncodedRelease
+from bench.inversion.encoding import Encoded, EncodedLines
+from bench.inversion.line_network import line_loss
 from bench.inversion.loss import reconstruction_loss
 from bench.inversion.optimizer import Optimizer
 from bench.inversion.plan import Training
@@ -35,7 +36,13 @@ class Learner(Generic[Module]):
         """Set the average to the current weights."""
         self.average = {name: value.clone() for name, value in self.module.state_dict().items()}
 
-    def learn(self, points: EncodedRelease, photographs: Tensor, progress: float, parallel: nn.Module | None = None) -> Tensor:
+    def compute_loss(self, outputs: Any, points: Encoded, photographs: Tensor) -> Tensor:
+        """Return the loss of the network's outputs. -> ()"""
+        if isinstance(points, EncodedLines):
+            return line_loss(outputs, photographs, points)
+        return self.loss(outputs, photographs)
+
+    def learn(self, points: Encoded, photographs: Tensor, progress: float, parallel: nn.Module | None = None) -> Tensor:
         """Execute one training step, and return its loss. -> ()
 
         `progress` is the completed fraction of the training after the warm-up. If several processes split the batch, `parallel`
@@ -45,9 +52,10 @@ class Learner(Generic[Module]):
         factor = (self.step + 1) / warm if self.step < warm else 0.5 * (1 + math.cos(math.pi * progress))
         self.optimizer.rate = self.training.rate * factor
         self.module.train()
+        points = points.to(self.device)
         with torch.autocast(self.device.type, self.dtype, enabled=self.dtype != torch.float32):
-            reconstructions = (parallel or self.module)(points.to(self.device))
-        loss = self.loss(reconstructions, photographs.to(self.device))
+            outputs = (parallel or self.module)(points)
+        loss = self.compute_loss(outputs, points, photographs.to(self.device))
         self.module.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self.module.parameters(), 1.0)

@@ -36,6 +36,7 @@ class Shape:
     last: int = 32  # channels at 1/2
     patch: int = 6  # cells: the side of the patch around a keypoint
     painted: int = 16  # channels of the patch; the name is part of the file format
+    samples: int = 0  # points on each line of a network that reads lines (`bench.inversion.line_network`); 0: it reads points
 
 
 class Inverter(nn.Module):
@@ -66,10 +67,14 @@ class Inverter(nn.Module):
         self.paint = nn.Conv2d(shape.last, 3 * (CELL // 2) ** 2, 3, padding=1)
 
     def forward(self, points: EncodedRelease) -> Tensor:
-        rows, columns = points.grid
+        return self.decode(self.scatter(points), points.size)
+
+    def decode(self, cells: Tensor, size: tuple[int, int]) -> Tensor:
+        """Reconstruct photographs of H, W pixels from a grid. (B, first + painted, H/4, W/4) -> (B, 3, H, W)"""
+        rows, columns = cells.shape[2:]
         step = 2 ** len(self.down)  # cell size of the deepest level; other image sizes get an empty margin
         margin = (0, -columns % step, 0, -rows % step)
-        level = self.stem(nnf.pad(self.scatter(points), margin))
+        level = self.stem(nnf.pad(cells, margin))
         levels = [level]
         for down in self.down:
             levels.append(down(levels[-1]))
@@ -78,13 +83,15 @@ class Inverter(nn.Module):
             level = up(level, levels.pop())
         half = self.refine(upsample(self.narrow(level)))
         images = nnf.pixel_shuffle(self.paint(half).float(), CELL // 2) + 0.5
-        return images[:, :, : points.size[0], : points.size[1]]  # (B, 3, H, W)
+        return images[:, :, : size[0], : size[1]]
 
     def scatter(self, points: EncodedRelease) -> Tensor:
         """Sum the embeddings and patches of keypoints in a grid. -> (B, first + painted, H/4, W/4), channels last"""
         hidden = self.embed_points(points)
         own = self.own(hidden)
         with_count = torch.cat([own, torch.ones_like(own[:, :1])], dim=1)
+        if points.weights is not None:
+            with_count = with_count * points.weights[:, None]
         cells = sum_by_cell(with_count, points.image, points.coordinates.long(), (points.batch, *points.grid))
         return torch.cat([cells, self.scatter_patches(hidden, points)], dim=3).permute(0, 3, 1, 2)
 
@@ -95,9 +102,11 @@ class Inverter(nn.Module):
         steps = torch.arange(side, device=corner.device)
         row, column = corner[:, 1, None, None] + steps[:, None], corner[:, 0, None, None] + steps  # (P, side, 1), (P, 1, side)
         cells = torch.stack(torch.broadcast_tensors(column, row), dim=3).view(-1, 2)
-        patches = self.around(hidden).view(-1, self.shape.painted)  # (P side side, painted)
+        patches = self.around(hidden)  # (P, side side painted)
+        if points.weights is not None:
+            patches = patches * points.weights[:, None]
         shape = points.batch, rows + 2 * side, columns + 2 * side
-        grid = sum_by_cell(patches, points.image.repeat_interleave(side * side), cells, shape)
+        grid = sum_by_cell(patches.view(-1, self.shape.painted), points.image.repeat_interleave(side * side), cells, shape)
         return grid[:, side : side + rows, side : side + columns]
 
     def embed_points(self, points: EncodedRelease) -> Tensor:

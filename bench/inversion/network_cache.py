@@ -12,6 +12,7 @@ from bench.core import environment
 from bench.inversion import train, weights
 from bench.inversion.plan import Plan
 from bench.registry import spec
+from bench.registry.composed import list_parts
 
 KIND = "networks"
 
@@ -38,7 +39,7 @@ def build_key(plan: Plan) -> dict[str, Any]:
         "training": dataclasses.asdict(plan.training),
         "source": provenance.hash_modules(
             train.__name__,
-            *sorted({type(target.defense).__module__ for target in plan.targets}),
+            *sorted({type(part).__module__ for target in plan.targets for part in list_parts(target.defense)}),
             type(plan.extractor).__module__,
         ),
         "environment": environment.describe_platform(),

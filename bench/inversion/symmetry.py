@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, TypeVar, cast
 import numpy as np
 
 from bench.api import Extractor
-from bench.types import Bytes, Descriptors, Floats, Indices, Points, Release, Subspaces, WordSets
+from bench.types import Bytes, Descriptors, Floats, Indices, Lines, Permuted, Points, Positions, Release, Subspaces, WordSets
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -47,17 +47,31 @@ class Symmetry:
         Raises
         ------
         TypeError
-            if there is a permutation and releases of this type have none.
+            if there is a permutation and releases of this type have none, or if positions of this type have no symmetries.
         """
         if self.order is not None:
             release = cast(AnyRelease, _permute(release, self.order, self))
-        (width, height), (x, y) = release.size, release.keypoints.T
+        positions = _transform_positions(release.positions, self, release.size)
+        size = release.size[::-1] if self.turns % 2 else release.size
+        return dataclasses.replace(release, positions=positions, size=size)
+
+    def transform_points(self, points: Floats, size: tuple[int, int]) -> Floats:
+        """Return points (N, 2) of a photograph of `size` in the transformed photograph."""
+        (width, height), (x, y) = size, points.T
         if self.mirrored:
             x = width - x
         for _ in range(self.turns):
             x, y, width, height = y, width - x, height, width
-        positions = Points(keypoints=np.stack([x, y], axis=1, dtype=np.float32))
-        return dataclasses.replace(release, positions=positions, size=(width, height))
+        return np.stack([x, y], axis=1, dtype=np.float32)
+
+    def transform_lines(self, lines: Floats, size: tuple[int, int]) -> Floats:
+        """Return lines (N, 3) of a photograph of `size` in the transformed photograph."""
+        (width, height), (a, b, c) = size, lines.T
+        if self.mirrored:
+            a, c = -a, c + a * width
+        for _ in range(self.turns):
+            a, b, c, width, height = b, -a, c + a * width, height, width
+        return np.stack([a, b, c], axis=1, dtype=np.float32)
 
 
 IDENTITY = Symmetry(False, 0, None)
@@ -77,6 +91,27 @@ def find_symmetries(extractor: Extractor) -> tuple[Symmetry, ...]:
 def _rotate(symmetry: Symmetry, turn: Indices) -> Symmetry:
     order = turn if symmetry.order is None else symmetry.order[turn]
     return Symmetry(symmetry.mirrored, symmetry.turns + 1, order)
+
+
+@singledispatch
+def _transform_positions(positions: Positions, symmetry: Symmetry, size: tuple[int, int]) -> Positions:
+    raise TypeError(f"symmetries of {type(positions).__name__} are not defined")
+
+
+@_transform_positions.register
+def _(positions: Points, symmetry: Symmetry, size: tuple[int, int]) -> Positions:
+    return Points(keypoints=symmetry.transform_points(positions.keypoints, size))
+
+
+@_transform_positions.register
+def _(positions: Lines, symmetry: Symmetry, size: tuple[int, int]) -> Positions:
+    return Lines(lines=symmetry.transform_lines(positions.lines, size))
+
+
+@_transform_positions.register
+def _(positions: Permuted, symmetry: Symmetry, size: tuple[int, int]) -> Positions:
+    points = symmetry.transform_points(positions.points, size)
+    return Permuted(lines=symmetry.transform_lines(positions.lines, size), points=points)
 
 
 @singledispatch

@@ -37,15 +37,16 @@ from bench.inversion.data import (
     measure_quantisation_error,
     quantise,
 )
-from bench.inversion.encoding import EncodedRelease, Encoding, encode, stack
+from bench.inversion.encoding import Encoded, Encoding, encode, encode_lines, stack
 from bench.inversion.learner import Learner
+from bench.inversion.line_network import SAMPLES, LineInverter, build_network
 from bench.inversion.log import Log
 from bench.inversion.loss import ssim
 from bench.inversion.network import Inverter, Shape
 from bench.inversion.plan import Plan, Training
 from bench.inversion.process_group import ProcessGroup, launch
-from bench.inversion.reconstruct import infer
-from bench.inversion.symmetry import POSITION_SYMMETRIES, find_symmetries
+from bench.inversion.reconstruct import infer, locate_keypoints
+from bench.inversion.symmetry import IDENTITY, POSITION_SYMMETRIES, find_symmetries
 from bench.settings import Asset, OneOf
 from bench.types import Subspaces, WordSets
 
@@ -92,9 +93,10 @@ def train_worker(group: ProcessGroup, plan: Plan, out: Path, log: Path | None) -
     examples = dataclasses.replace(examples, symmetries=symmetries)
     slots, length = _measure_stack(held_out, unseen[0], encoding)
     first = held_out.release_view(unseen[0], np.random.default_rng(0))
-    sample = encode([first.release], [first.settings], slots, encoding)
+    samples = _count_samples(targets, encoding)
+    sample, _ = build_batch([first], slots, encoding, samples)
     candidates = slots if encoding == "invariant" and sets else 0
-    shape = Shape(inputs=sample.values.shape[1], candidates=candidates, length=length, widths=plan.widths)
+    shape = Shape(inputs=sample.values.shape[1], candidates=candidates, length=length, widths=plan.widths, samples=samples)
     initial = None if plan.initial_checkpoint is None else weights.load(plan.initial_checkpoint)
     meta = {
         **weights.describe(targets, extractor, Public(), plan.keypoints),
@@ -182,6 +184,22 @@ def _check_targets(targets: Sequence[Target]) -> bool:
     return WordSets in releases
 
 
+def _count_samples(targets: Sequence[Target], encoding: Encoding) -> int:
+    """Return the number of points on each line that the network reads; 0 if the targets release points.
+
+    Raises
+    ------
+    UserError
+        if only some targets release lines, or the encoding is not "invariant".
+    """
+    hidden = {target.defense.hides_positions() for target in targets}
+    if len(hidden) > 1:
+        raise UserError("--defense: a network for lines reads no points; train another network for the other defenses")
+    if hidden == {True} and encoding != "invariant":
+        raise UserError(f"--encoding {encoding}: a network for lines needs the encoding invariant")
+    return SAMPLES if hidden == {True} else 0
+
+
 def _find_dictionary(targets: Sequence[Target]) -> Asset | None:
     """Return the dictionary by which the targets quantise descriptors; None if none of them does.
 
@@ -253,23 +271,23 @@ def _checkpoint_path(out: Path) -> Path:
     return out.with_name(out.name + ".checkpoint")
 
 
-class _Trainer(Learner[Inverter]):
+class _Trainer(Learner[Inverter | LineInverter]):
     """A learner with its part of each batch, and a checkpoint to resume from."""
 
     def __init__(self, group: ProcessGroup, shape: Shape, training: Training, out: Path, meta: dict[str, Any], log: Log) -> None:
         torch.manual_seed(training.seed)
-        super().__init__(Inverter(shape), training)
+        super().__init__(build_network(shape), training)
         self.group, self.meta, self.log = group, meta, log
         self.path = _checkpoint_path(out)
         if self.path.is_file():
             self._restore()
 
-    def load_initial_checkpoint(self, trained: Inverter, candidates: int) -> None:
+    def load_initial_checkpoint(self, trained: Inverter | LineInverter, candidates: int) -> None:
         """Initialise weights and average from another network."""
         weights.initialise_from(self.module, trained, candidates)
         self.reset_average()
 
-    def run(self, examples: Examples) -> Inverter:
+    def run(self, examples: Examples) -> Inverter | LineInverter:
         """Train to the end, and return the network with averaged weights."""
         if self.step == self.training.steps:
             return self.load_average()
@@ -287,13 +305,13 @@ class _Trainer(Learner[Inverter]):
         self._save()
         return self.load_average()
 
-    def _batches(self, examples: Examples) -> Iterator[tuple[EncodedRelease, Tensor]]:
+    def _batches(self, examples: Examples) -> Iterator[tuple[Encoded, Tensor]]:
         """Yield this process's parts of the batches from the next step on. Threads build them in advance."""
         training, indices = self.training, self.group.assign_indices(self.training.batch)
 
-        def build(step: int) -> tuple[EncodedRelease, Tensor]:
+        def build(step: int) -> tuple[Encoded, Tensor]:
             batch = [examples.draw(np.random.default_rng([training.seed, step, index])) for index in indices]
-            return build_batch(batch, self.meta["slots"], self.meta["encoding"])
+            return build_batch(batch, self.meta["slots"], self.meta["encoding"], self.module.shape.samples)
 
         workers = max(1, (os.cpu_count() or 1) // self.group.size) if isinstance(examples.views, LazyViews) else 1
         with ThreadPoolExecutor(workers) as executor:
@@ -304,7 +322,7 @@ class _Trainer(Learner[Inverter]):
                 pending.extend(executor.submit(build, step) for step in itertools.islice(steps, 1))
                 yield batch
 
-    def _advance(self, parallel: nn.Module, points: EncodedRelease, photographs: Tensor) -> float:
+    def _advance(self, parallel: nn.Module, points: Encoded, photographs: Tensor) -> float:
         """Execute one step of the schedule. -> the loss of the whole batch"""
         warm = self.training.warmup
         progress = (self.step - warm) / max(1, self.training.steps - warm)
@@ -334,24 +352,37 @@ class _Trainer(Learner[Inverter]):
         self.optimizer.restore(tensors["moments"])
 
 
-def build_batch(examples: Sequence[Example], slots: int, encoding: Encoding) -> tuple[EncodedRelease, Tensor]:
-    """Encode examples. -> the releases, (B, 3, 256, 256) photographs in [0, 1]"""
-    points = encode([example.release for example in examples], [example.settings for example in examples], slots, encoding)
+def build_batch(examples: Sequence[Example], slots: int, encoding: Encoding, samples: int = 0) -> tuple[Encoded, Tensor]:
+    """Encode examples of points, or of lines with `samples` each. -> the releases, (B, 3, 256, 256) photographs in [0, 1]"""
+    releases, settings = [example.release for example in examples], [example.settings for example in examples]
+    points: Encoded
+    if samples:
+        points = encode_lines(releases, settings, slots, encoding, samples, [example.keypoints for example in examples])
+    else:
+        points = encode(releases, settings, slots, encoding)
     pixels = torch.from_numpy(np.stack([example.pixels for example in examples]))
     return points, pixels.permute(0, 3, 1, 2).float() / 255
 
 
 def validate(
-    module: nn.Module, examples: Examples, views: Sequence[PhotographView], slots: int, encoding: Encoding
+    module: Inverter | LineInverter, examples: Examples, views: Sequence[PhotographView], slots: int, encoding: Encoding
 ) -> dict[str, float]:
-    """Return mean MAE, SSIM (where its window fits) and PSNR over whole views. Settings are drawn with a fixed seed."""
+    """Return mean MAE, SSIM (where its window fits) and PSNR over whole views. Settings are drawn with a fixed seed.
+
+    For lines also the mean over views of the median position error in pixels.
+    """
     device, rng = pick_device(), np.random.default_rng(0)
-    scores = []
+    scores, errors = [], []
     for view in views:
-        points, truth = build_batch([examples.release_view(view, rng)], slots, encoding)
+        example = examples.release_view(view, rng)
+        points, truth = build_batch([example], slots, encoding, module.shape.samples)
         scores.append(score(infer(module, points.to(device)).cpu()[0], truth[0]))
+        if isinstance(module, LineInverter):
+            located = locate_keypoints(module, example.release, [IDENTITY], example.settings, slots, encoding)
+            errors.append(np.median(np.linalg.norm(located - example.keypoints, axis=1)))
     mae, similarity, psnr = np.mean(scores, axis=0)
-    return {"photographs": len(views), "mae": float(mae), "ssim": float(similarity), "psnr": float(psnr)}
+    positions = {"position-error": float(np.mean(errors))} if errors else {}
+    return {"photographs": len(views), "mae": float(mae), "ssim": float(similarity), "psnr": float(psnr)} | positions
 
 
 def score(reconstruction: Tensor, photograph: Tensor) -> tuple[float, float, float]:

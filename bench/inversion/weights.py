@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -12,13 +12,14 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 
 from bench.api import Defense, Extractor
-from bench.codebook.public import Public
+from bench.codebook.public import ASSETS, Public
 from bench.core.errors import UserError
 from bench.formats import tensor_file
 from bench.formats.network_file import NetworkFile, build_module
 from bench.images.views import LIMIT
 from bench.inversion.encoding import Encoding
 from bench.registry import fields, spec
+from bench.registry.composed import list_parts
 from bench.settings import Between, OneOf
 from bench.types import Floats
 
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from torch import nn
 
     from bench.inversion.data import Target
+    from bench.inversion.line_network import LineInverter
     from bench.inversion.network import Inverter, Shape
 
 KIND = "inversion-network"
@@ -38,7 +40,7 @@ class Network(NetworkFile):
     """A trained network, ready for inference."""
 
     @cached_property
-    def module(self) -> Inverter:
+    def module(self) -> Inverter | LineInverter:
         """The network itself, built at first use.
 
         Raises
@@ -49,10 +51,11 @@ class Network(NetworkFile):
         import torch
 
         from bench.core.device import pick_device
-        from bench.inversion.network import Inverter, Shape
+        from bench.inversion.line_network import build_network
+        from bench.inversion.network import Shape
 
         shape = self.meta["shape"]
-        module = build_module(self.path, lambda: Inverter(Shape(**{**shape, "widths": tuple(shape["widths"])})))
+        module = build_module(self.path, lambda: build_network(Shape(**{**shape, "widths": tuple(shape["widths"])})))
         for name, value in module.state_dict().items():
             if not value.is_floating_point():
                 continue  # batch norm's counter of batches, used in training only
@@ -139,13 +142,16 @@ def _is_setting(text: Any) -> bool:
     return isinstance(values, list) and all(isinstance(value, str | int | float | None) for value in values)
 
 
-def initialise_from(fresh: Inverter, trained: Inverter, candidates: int) -> None:
+def initialise_from(fresh: Inverter | LineInverter, trained: Inverter | LineInverter, candidates: int) -> None:
     """Initialise a network from a network for the same kind of release, or for raw descriptors.
 
     From a network for raw descriptors, the first layer treats the first `candidates` slots as descriptors. These are the words of
     a set, or the point of a subspace nearest to zero. Weights are divided by √candidates, which preserves the size of a sum of
     independent slots. The other slots and the settings get weight zero. All other layers are copied. If the raw descriptors have
     another length, they are other features: the first layer remains as it is.
+
+    A network that reads lines takes its inversion network from one that reads points. If its levels are narrower, it takes the
+    first channels of each.
 
     Raises
     ------
@@ -154,13 +160,26 @@ def initialise_from(fresh: Inverter, trained: Inverter, candidates: int) -> None
     """
     import torch
 
+    from bench.inversion.line_network import LineInverter
+
     with torch.no_grad():
-        _copy_weights(fresh, trained, candidates)
+        if isinstance(trained, LineInverter):
+            if not isinstance(fresh, LineInverter):
+                raise UserError("--initial-checkpoint: that network reads lines; pass a network for points")
+            _copy_weights(fresh.inverter, trained.inverter, candidates)
+            parts = trained.state_dict().items()
+            fresh.load_state_dict({k: v for k, v in parts if not k.startswith("inverter.")}, strict=False)
+        elif isinstance(fresh, LineInverter):
+            _copy_weights(fresh.inverter, trained, candidates, narrower=True)
+        else:
+            _copy_weights(fresh, trained, candidates)
 
 
-def _copy_weights(fresh: Inverter, trained: Inverter, candidates: int) -> None:
+def _copy_weights(fresh: Inverter, trained: Inverter, candidates: int, narrower: bool = False) -> None:
     first = "embed.0.weight"
     old, new = trained.state_dict(), fresh.state_dict()
+    if narrower and len(fresh.shape.widths) == len(trained.shape.widths):
+        old = {name: value[tuple(map(slice, new[name].shape))] if name != first else value for name, value in old.items()}
     if any(old[name].shape != value.shape for name, value in new.items() if name != first):
         raise UserError("--initial-checkpoint: that network has other sizes; pass a network with equal --widths")
     for name in new.keys() - {first}:
@@ -200,11 +219,17 @@ def describe(
 
 
 def _describe_target(target: Target, public: Public) -> dict[str, Any]:
-    configuration, supported = spec.to_json_with_digests(target.defense, public), target.supported_settings
+    configuration, supported = _configure(target.defense, public), target.supported_settings
     return {
         "defense": {field: value for field, value in configuration.items() if field not in supported},
         "serves": {field: _encode_setting(setting) for field, setting in supported.items()},
     }
+
+
+def _configure(defense: Defense, public: Public) -> dict[str, Any]:
+    """Return name and fields of a defense; of a composed one, its name and the fields of both parts."""
+    parts = [spec.to_json_with_digests(part, public) for part in list_parts(defense)]
+    return {field: value for part in parts for field, value in part.items()} | {"name": defense.name()}
 
 
 def _list_targets(meta: dict[str, Any]) -> list[dict[str, Any]]:
@@ -230,16 +255,36 @@ def explain_incompatible(meta: dict[str, Any], defense: Defense, extractor: Extr
     return explain_other_features(meta, extractor, public)
 
 
+def find_network(
+    asset: str, shipped: Mapping[str, str], defense: Defense, extractor: Extractor, public: Public
+) -> tuple[Path | None, str]:
+    """Return the path of a network for these releases, or the reasons in brackets why none of the networks suits.
+
+    `asset` is a file, or a name of shipped networks: `shipped` has the pattern of their files for each name.
+    """
+    candidates = sorted(ASSETS.glob(shipped[asset])) if asset in shipped else [Path(asset)]
+    reasons = []
+    for path in candidates:
+        meta = load(path).meta
+        reason = explain_incompatible(meta, defense, extractor, public)
+        if reason is None:
+            return path, ""
+        if asset not in shipped or defense.name() in list_defenses(meta):
+            reasons.append(f"{path.name} was {reason}")
+    return None, f" ({'; '.join(reasons)})" if reasons else ""
+
+
 def _explain_other_releases(target: dict[str, Any], defense: Defense, public: Public) -> str | None:
     """Return the reason why the releases of one target are not those of `defense`."""
     trained_for, supported = target["defense"], _decode_settings(target)
     if trained_for["name"] != defense.name():
         return f"trained for {trained_for['name']}"
-    configuration = spec.to_json_with_digests(defense, public)
+    configuration = _configure(defense, public)
     for field, setting in supported.items():
         if getattr(defense, field) not in setting:
             return f"trained for {field} {setting}, not {getattr(defense, field)}"
-    trained = fields.list_defaults(type(defense)) | trained_for  # a field added after the training counts as its default
+    defaults = {name: value for part in list_parts(defense) for name, value in fields.list_defaults(type(part)).items()}
+    trained = defaults | trained_for  # a field added after the training counts as its default
     for field in sorted((configuration.keys() | trained_for.keys()) - supported.keys()):
         if configuration.get(field) != trained.get(field):
             return f"trained for {field} {trained.get(field)}, not {configuration.get(field)}"

@@ -16,7 +16,7 @@ from bench.codebook.public import Public
 from bench.core.errors import UserError
 from bench.core.hashing import canonical_json
 from bench.registry import spec
-from bench.types import Features, Points, Release
+from bench.types import Features, Release
 
 KEY_BYTES = 32  # bytes
 
@@ -50,7 +50,7 @@ def protect(features: Features, defense: Defense, public: Public | None = None, 
 
 def hide_order(secret: Features, defense: Defense, rng: np.random.Generator) -> Features:
     """Return the features in random order if the defense hides positions: their order by position would reveal them."""
-    return secret if defense.positions is Points else secret.take(rng.permutation(len(secret)))
+    return secret.take(rng.permutation(len(secret))) if defense.hides_positions() else secret
 
 
 def create_generator(key: bytes) -> np.random.Generator:

@@ -17,9 +17,11 @@ from typing import Any
 import numpy as np
 
 from bench.api import Extractor
-from bench.codebook.public import ASSETS
+from bench.codebook.public import ASSETS, Public
 from bench.core.errors import UserError
 from bench.formats import tensor_file
+from bench.inversion import weights
+from bench.registry import discovery, spec
 from bench.types import Floats, Indices
 
 KIND = "neighbour-model"
@@ -36,24 +38,22 @@ class NeighbourModel:
     meta: dict[str, Any]
     digest: str
 
-    def explain_other_features(self, extractor: Extractor) -> str | None:
+    def explain_other_features(self, extractor: Extractor, public: Public) -> str | None:
         """Return the reason why the model does not suit the features of `extractor`; None if it was trained for them."""
-        trained = self.meta["extractor"]
-        if extractor.name() != trained:
-            return f"the model of neighbours was trained for {trained}, not {extractor.name()}"
-        return None
+        reason = weights.explain_other_features(self.meta, extractor, public)
+        return reason and f"the model of neighbours was {reason}"
 
     @cached_property
-    def weights(self) -> dict[str, Floats]:
+    def layers(self) -> dict[str, Floats]:
         """The weights in single precision."""
         return {name: self.arrays[name].astype(np.float32) for name in SHAPES}
 
     def embed(self, descriptors: Floats) -> Floats:
         """Return the embedding of each descriptor. (N, D) -> (N, R)"""
-        weights = self.weights
-        hidden = descriptors * np.float32(descriptors.shape[1] ** 0.5) @ weights["hidden.weight"].T + weights["hidden.bias"]
+        layers = self.layers
+        hidden = descriptors * np.float32(descriptors.shape[1] ** 0.5) @ layers["hidden.weight"].T + layers["hidden.bias"]
         hidden = hidden / (1 + np.exp(-hidden))  # SiLU
-        embedded: Floats = hidden @ weights["out.weight"].T + weights["out.bias"]
+        embedded: Floats = hidden @ layers["out.weight"].T + layers["out.bias"]
         return embedded
 
     def log_ratios(self, candidates: Floats, odds: float = np.inf) -> Floats:
@@ -70,7 +70,7 @@ class NeighbourModel:
         ratios = np.full((count, count), 1 - (m * chance) ** 2, dtype=np.float32)
         for one in range(m):
             for other in range(m):
-                logs = (embedded[:, one] * self.weights["scale"]) @ embedded[:, other].T + self.weights["bias"]
+                logs = (embedded[:, one] * self.layers["scale"]) @ embedded[:, other].T + self.layers["bias"]
                 ratios += np.float32(chance**2) * np.exp(np.clip(logs, -MAX_LOG_RATIO, MAX_LOG_RATIO))
         result: Floats = np.log(ratios)
         np.fill_diagonal(result, -np.inf)
@@ -107,4 +107,6 @@ def _load(path: Path, version: object) -> NeighbourModel:
     arrays, meta, digest = tensor_file.load(path, KIND)
     if missing := [name for name in SHAPES if name not in arrays]:
         raise UserError(f"{path}: has no tensor {missing[0]}")
+    if isinstance(trained := meta.get("extractor"), str):  # the shipped file: its extractor had the default fields
+        meta = {**meta, "extractor": spec.to_json(spec.read(trained, discovery.EXTRACTOR))}
     return NeighbourModel(arrays=arrays, meta=meta, digest=digest)

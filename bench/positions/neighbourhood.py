@@ -12,14 +12,10 @@ estimate is the weighted median of the crossings.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
-from numpy.typing import NDArray
 
+from bench.geometry.lines import ClippedLines, Doubles, clip_lines
 from bench.types import Floats, Indices
-
-Doubles = NDArray[np.float64]
 
 MIN_SINE = 0.02  # of the angle of two lines; lines that are closer to parallel say nothing about each other
 BLOCK = 256  # lines that are processed together
@@ -82,39 +78,6 @@ def find_densest(lines: Floats, size: tuple[int, int], width: float = 8.0) -> Fl
         density = gaussian_filter1d(counts, width, mode="nearest")
         best[row] = (edges[density.argmax()] + edges[density.argmax() + 1]) / 2
     return clipped.locate(best)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ClippedLines:
-    """Lines with their parts in the image. The point at t is foot + t · along."""
-
-    normals: Doubles  # (N, 2) unit
-    offsets: Doubles  # (N,) c
-    along: Doubles  # (N, 2) unit
-    feet: Doubles  # (N, 2) the points of the lines nearest to the image's centre
-    first: Doubles  # (N,) t at one end of the part in the image; 0 if the line is outside
-    last: Doubles  # (N,) t at the other end
-
-    def locate(self, along: Doubles) -> Floats:
-        """Return the points at t = `along` (N,). -> (N, 2) float32"""
-        return (self.feet + along[:, None] * self.along).astype(np.float32)
-
-
-def clip_lines(lines: Floats, size: tuple[int, int]) -> ClippedLines:
-    """Clip lines (N, 3) to the image."""
-    exact, corner = np.asarray(lines, dtype=np.float64), np.array(size, dtype=np.float64)
-    normals = exact[:, :2]
-    along = np.stack([-normals[:, 1], normals[:, 0]], axis=1)
-    feet = corner / 2 - (normals @ (corner / 2) + exact[:, 2])[:, None] * normals
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ends = np.stack([-feet / along, (corner - feet) / along])  # (2, N, 2)
-    # A line parallel to a side has no crossing with it, and is between the two sides or outside.
-    parallel, between = np.abs(along) < 1e-9, (feet >= 0) & (feet <= corner)
-    first = np.where(parallel, np.where(between, -np.inf, np.inf), ends.min(axis=0)).max(axis=1)
-    last = np.where(parallel, np.where(between, np.inf, -np.inf), ends.max(axis=0)).min(axis=1)
-    outside = first > last
-    first, last = (np.where(outside, 0.0, end) for end in (first, last))
-    return ClippedLines(normals=normals, offsets=exact[:, 2], along=along, feet=feet, first=first, last=last)
 
 
 def _cross(lines: ClippedLines, rows: slice, near: Indices) -> tuple[Doubles, Doubles]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import TYPE_CHECKING
@@ -12,13 +12,13 @@ import numpy as np
 
 from bench.api import Defense, Privacy
 from bench.core.errors import UserError
-from bench.types import Descriptors, Features, Points, Release
+from bench.types import Descriptors, Features, Release
 
 if TYPE_CHECKING:
     from bench.codebook.public import Public
 
 # Declarations of the defense of descriptors that hold for both together.
-INHERITED = ("releases", "dictionary_field", "word_count_field", "noisy")
+INHERITED = ("releases", "supported_settings", "dictionary_field", "word_count_field", "noisy")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,7 +33,7 @@ class Composed(Defense):
     def __post_init__(self) -> None:
         for name in INHERITED:
             object.__setattr__(self, name, getattr(self.descriptors, name))
-        for field in (self.dictionary_field, self.word_count_field):
+        for field in (*self.supported_settings, self.dictionary_field, self.word_count_field):
             if field is not None:
                 object.__setattr__(self, field, getattr(self.descriptors, field))
         object.__setattr__(self, "positions", self.geometry.positions)
@@ -72,8 +72,8 @@ def compose(defenses: Sequence[Defense]) -> Composed:
         unless one hides positions and the other does not.
     """
     names = "+".join(defense.name() for defense in defenses)
-    geometry = [defense for defense in defenses if hides_positions(defense)]
-    others = [defense for defense in defenses if not hides_positions(defense)]
+    geometry = [defense for defense in defenses if hides_positions_alone(defense)]
+    others = [defense for defense in defenses if not hides_positions_alone(defense)]
     for kind, same in (("positions", geometry), ("descriptors", others)):
         if len(same) > 1:
             doubled = " and ".join(defense.name() for defense in same)
@@ -81,9 +81,16 @@ def compose(defenses: Sequence[Defense]) -> Composed:
     return Composed(geometry=geometry[0], descriptors=others[0])
 
 
-def hides_positions(defense: Defense) -> bool:
+def hides_positions_alone(defense: Defense) -> bool:
     """Return whether a defense hides positions and releases descriptors unchanged, so that it can be composed with another."""
-    return defense.positions is not Points and issubclass(defense.releases, Descriptors)
+    return defense.hides_positions() and issubclass(defense.releases, Descriptors)
+
+
+def configure(defense: Defense, settings: Mapping[str, object]) -> Defense:
+    """Return the defense with other settings; those of a composed one are settings of its defense of descriptors."""
+    if isinstance(defense, Composed):
+        return dataclasses.replace(defense, descriptors=configure(defense.descriptors, settings))
+    return dataclasses.replace(defense, **settings)  # type: ignore[type-var]  # plugins are dataclasses
 
 
 def list_parts(defense: Defense) -> tuple[Defense, ...]:

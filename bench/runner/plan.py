@@ -19,7 +19,6 @@ from bench.runner import records
 from bench.runner.records import EVERY_SAMPLE, Record
 from bench.task_api import Execute, Task, execute_in_process
 from bench.threat_model import ServerMap
-from bench.types import Points
 
 VARIABLE = "FEATURE_PRIVACY_EXTRA_METRICS"  # environment variable
 NO_EXTRAS = "none"  # its value for runs whose records are the same in all installations
@@ -168,7 +167,7 @@ def build_plan(configuration: RunConfiguration, describe: Describe = environment
 
 def select_metrics(metrics: Iterable[Metric], defense: Defense) -> tuple[Metric, ...]:
     """Return the metrics of a defense, by the defense alone: an experiment is the same whatever else a run has."""
-    return tuple(metric for metric in metrics if metric.compares != "positions" or not issubclass(defense.positions, Points))
+    return tuple(metric for metric in metrics if metric.compares != "positions" or defense.hides_positions())
 
 
 def _explain_hidden_positions(task: Task, defense: Defense) -> str | None:

@@ -63,7 +63,7 @@ class Reconstruction(Task):
         served: set[type[Knowledge]] = {ServerMap} if public.scene_index is not None else set()
         if defense.dictionary_field is not None and issubclass(defense.releases, WordSets):
             served.add(TrueWords)
-        if not issubclass(defense.positions, Points):
+        if defense.hides_positions():
             served.add(TrueNeighbours)
         missing = attack.needs - offer_knowledge(attack, defense, public).keys() - RELEASES - served
         if missing:
@@ -89,10 +89,10 @@ class Reconstruction(Task):
         attack = trial.attack
         if attack is None:
             raise SampleError("reconstruction needs an attack")
-        if isinstance(attack, ImageAttack):
-            return compute_metrics(trial, None, reconstruct_image(attack, build_view(trial), trial))
         if isinstance(attack, PositionAttack):
             return self._evaluate_positions(attack, trial)
+        if isinstance(attack, ImageAttack):
+            return compute_metrics(trial, None, reconstruct_image(attack, build_view(trial), trial))
         recovered = attack_cache.recover_cached(attack, trial, build_view(trial))
         inverter, undefended, reason = self._load_inverter(attack, trial.defense, trial.extractor, trial.public)
         if reason is not None:
@@ -107,11 +107,17 @@ class Reconstruction(Task):
         return dataclasses.replace(outcome, saved_seconds=recovered.saved_seconds)
 
     def _evaluate_positions(self, attack: PositionAttack, trial: Trial) -> Outcome:
-        """Score the recovered positions, and the image that the inverter reconstructs from them and the released descriptors."""
+        """Score the recovered positions and an image: the attack's own one if it reconstructs images, else the inverter's.
+
+        The inverter reads the recovered positions and the released descriptors.
+        """
         view = build_view(trial)
         with wrap_plugin_errors(f"plugin {attack.name()}"):
             located = trial.execute(attack.locate, view, trial.rng)
             attack_cache.check_array(located, (len(trial.release), 2))
+        if isinstance(attack, ImageAttack):
+            image = reconstruct_image(attack, build_view(trial), trial)
+            return compute_metrics(trial, None, image, tuple(map(str, view.notes)), located)
         release = dataclasses.replace(trial.release, positions=Points(keypoints=located))
         inverter, left, reason = self._load_inverter(attack, trial.defense, trial.extractor, trial.public)
         if reason is not None:

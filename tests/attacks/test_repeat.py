@@ -16,10 +16,12 @@ from bench.extractors.sift import Sift
 from bench.geometry.nearest_words import unit_rows
 from bench.mechanisms.multi_release import bound_success, compute_success_chances, find_common_points, select_likeliest
 from bench.mechanisms.subset import draw_word_subsets, log10_chance
+from bench.registry.composed import compose
 from bench.threat_model import RepeatedReleases
 from bench.types import Features, Points, Release, Subspaces
 from defenses.affine import Affine
 from defenses.ldp import LDP
+from defenses.lines import RandomLines
 from defenses.naive_ldp import NaiveLDP
 from leaderboard import multi_release
 
@@ -222,3 +224,10 @@ def test_curve():
         [row["bound"] for row in curve],
         [row["success"] for row in curve],
     ]
+
+
+def test_it_needs_one_order_of_keypoints():
+    """Defenses that hide positions shuffle the keypoints of each release."""
+    composed = compose([RandomLines(), LDP()])
+    assert "random order" in Repeat().explain_not_applicable(composed, Sift(), Public())
+    assert Repeat().explain_not_applicable(LDP(), Sift(), Public()) is None  # control

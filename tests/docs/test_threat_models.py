@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from bench import threat_model
-from bench.api import Attack, ImageAttack
+from bench.api import Attack, ImageAttack, PositionAttack
 from bench.registry import discovery
 from bench.threat_model import Knowledge
 from bench.types import Descriptors, Release, Subspaces, WordSets
@@ -40,7 +40,8 @@ def _agrees(attack: type[Attack], releases: str, knowledge: str, recovers: str) 
     return (
         set(accepted) == set(attack.accepts)
         and set(re.findall(r"`(\w+)`", knowledge)) == {kind.__name__ for kind in attack.needs}
-        and (recovers == "image") == issubclass(attack, ImageAttack)
+        and ("image" in recovers.split(", ")) == issubclass(attack, ImageAttack)
+        and ("positions" in recovers.split(", ")) == issubclass(attack, PositionAttack)
     )
 
 

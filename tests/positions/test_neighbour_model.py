@@ -3,14 +3,27 @@
 import numpy as np
 import pytest
 
+from bench.api import Extractor
+from bench.codebook.public import Public
 from bench.core.errors import UserError
 from bench.extractors.sift import Sift
 from bench.formats import tensor_file
 from bench.images import photographs
+from bench.images.photographs import Source
 from bench.positions import neighbour_model
 from bench.positions.lines import draw_lines
 from bench.positions.neighbour_model import SHAPES, NeighbourModel, load, select_neighbours, weigh
 from bench.positions.neighbourhood import recover_positions
+from bench.types import Features
+
+
+class Disk(Extractor):
+    @classmethod
+    def name(cls) -> str:
+        return "disk"
+
+    def extract(self, image: np.ndarray, source: Source | None = None) -> Features:
+        raise NotImplementedError
 
 
 def draw_model(rng: np.random.Generator) -> NeighbourModel:
@@ -63,3 +76,11 @@ def test_a_file_without_a_tensor_is_refused(tmp_path, rng: np.random.Generator) 
     tensor_file.save(tmp_path / "x.safetensors", neighbour_model.KIND, arrays, {})
     with pytest.raises(UserError, match="scale"):
         load(tmp_path / "x.safetensors")
+
+
+def test_the_model_is_for_the_features_of_its_training() -> None:
+    """Name and fields of the extractor count, as for other networks."""
+    model = load()
+    assert model.explain_other_features(Sift(), Public()) is None
+    assert "upright True, not False" in str(model.explain_other_features(Sift(upright=False), Public()))
+    assert "features of sift, not disk" in str(model.explain_other_features(Disk(), Public()))

@@ -5,8 +5,9 @@ import pytest
 from scipy.spatial import cKDTree
 
 from bench.extractors.sift import Sift
+from bench.geometry.lines import clip_lines
 from bench.images import photographs
-from bench.positions.neighbourhood import clip_lines, find_densest, recover_positions
+from bench.positions.neighbourhood import find_densest, recover_positions
 
 SIZE = (200, 120)
 

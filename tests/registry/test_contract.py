@@ -116,6 +116,17 @@ def test_dictionary_of_sift_is_refused(plugin: type[Defense], tmp_path: Path) ->
             defense.protect(draw_features(length=length, signed=True), Public(), np.random.default_rng(0))
 
 
+@parametrize(discovery.DEFENSE)
+def test_signed_words_are_refused_for_sift(plugin: type[Defense], tmp_path: Path) -> None:
+    """Words of another extractor with equal length."""
+    defense = build_plugin(plugin)
+    if not fields.list_assets(defense):
+        return
+    words = write_dictionary(tmp_path, length=128, signed=True)
+    with pytest.raises(UserError, match=r"8-bit vectors of SIFT, the words of .* have signs"):
+        adapt(plugin, dictionary=words, database=words).protect(draw_features(), Public(), np.random.default_rng(0))
+
+
 REASONS = {"lattice": "does not declare 8-bit descriptors", "sparsity": "does not declare any"}
 
 

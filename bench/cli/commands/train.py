@@ -81,9 +81,10 @@ def execute(args: argparse.Namespace) -> int:
 
     targets = []
     for text in args.defense:
-        plugin, given = spec.parse(text, discovery.DEFENSE)
-        supported = {name: settings for name, settings in plugin.supported_settings.items() if name not in given}
-        targets.append(Target(defense=spec.build(plugin, given), supported_settings=supported))
+        defense = spec.read(text, discovery.DEFENSE)
+        given = {name for part in spec.split_parts(text) for name in spec.parse(part, discovery.DEFENSE)[1]}
+        supported = {name: settings for name, settings in defense.supported_settings.items() if name not in given}
+        targets.append(Target(defense=defense, supported_settings=supported))
     photographs, validation = split_validation(list_photographs(args.images), args.validation)
     profile = PROFILES[args.profile]
     overrides = {name: value for name in ("steps", "batch", "rate", "seed") if (value := getattr(args, name)) is not None}
