@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar, final
 
 import numpy as np
 
+from bench.core import environment
 from bench.settings import Between, OneOf
 from bench.threat_model import Knowledge
 from bench.types import Features, Floats, Indices, Lines, Points, Positions, Release, Subspaces
@@ -270,6 +272,13 @@ class Metric(Plugin, ABC):
     parameters: ClassVar[Mapping[str, Any]] = {}
     # Distributions of an optional extra. Where all are installed, `bench run` and suites compute the metric.
     packages: ClassVar[tuple[str, ...]] = ()
+    # Programs of the operating system, likewise.
+    programs: ClassVar[tuple[str, ...]] = ()
+
+    @classmethod
+    def is_installed(cls) -> bool:
+        """Return whether all packages and programs are installed."""
+        return all(map(environment.is_installed, cls.packages)) and all(map(shutil.which, cls.programs))
 
     @classmethod
     def description(cls) -> str:
@@ -285,6 +294,10 @@ class Metric(Plugin, ABC):
         For "views", the truth has (256, 16, 16) thumbnails (`bench.identification`): another view of the scene, then views of
         others. The estimate is an image.
         """
+
+    def describe_truth(self, truth: Floats) -> str | None:
+        """Return a note for the records on an image (H, W, 3) in [0, 1], such as the number of objects that are compared."""
+        return None
 
 
 class LocalMetric(Metric):

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image, ImageDraw, ImageFont
 
 from bench.api import Attack, Dataset, Defense, DescriptorAttack, Extractor, ImageAttack, Metric, PositionAttack, SelectiveAttack
 from bench.cache import feature_cache, store
@@ -37,7 +38,7 @@ from bench.localization.scene_index import SceneIndex
 from bench.task_api import Outcome, ProtectedImage, Task, Trial
 from bench.tasks.reconstruction import Reconstruction, build_view
 from bench.threat_model import TrueNeighbours, TrueWords
-from bench.types import Descriptors, Features, Floats, Indices, Lines, Permuted, Points, Release, Subspaces, WordSets
+from bench.types import Bytes, Descriptors, Features, Floats, Indices, Lines, Permuted, Points, Release, Subspaces, WordSets
 
 TOLERANCE = 1e-5  # of norms and angles in float32
 LINE_TOLERANCE = 1e-3  # pixels, between a keypoint and its line
@@ -174,9 +175,9 @@ def check_metric(metric: Metric, seed: int = 0) -> None:
         truth, estimate = draw_features(30, seed).keypoints, draw_features(30, seed + 1).keypoints
         best_estimate = truth.copy()
     else:
-        # A portrait, since a metric such as `face` has no value for a picture without a face. The estimate is noise alone, since
-        # a metric such as `identified` has its best value for a portrait under noise.
-        truth = (photographs.read(photographs.list_people()[0].path).pixels / 255).astype(np.float32)
+        # A portrait with a caption, since `face` has no value for a picture without a face, and `reads` for one without text. The
+        # estimate is noise alone, since a metric such as `identified` has its best value for a portrait under noise.
+        truth = _add_caption(photographs.read(photographs.list_people()[0].path).pixels)
         estimate, best_estimate = rng.random(truth.shape, np.float32), truth.copy()
         if metric.compares == "views":
             others = distractors.load_distractors().thumbnails[: distractors.COUNT]
@@ -192,6 +193,15 @@ def check_metric(metric: Metric, seed: int = 0) -> None:
     _require(perfect is None or low <= perfect <= high, "the value of the truth is outside the declared range")
     best = (high if metric.higher_is_better_for == "attacker" else low) if perfect is None else perfect
     _require(best > value if metric.higher_is_better_for == "attacker" else best < value, "the truth must be the best estimate")
+
+
+def _add_caption(pixels: Bytes) -> Floats:
+    """Return an image with two words on a white bar below. (H, W, 3) -> the same shape, float32 in [0, 1]"""
+    picture = Image.fromarray(pixels)
+    draw, top = ImageDraw.Draw(picture), picture.height - 48
+    draw.rectangle((0, top, *picture.size), "white")
+    draw.text((16, top + 8), "Station Road", "black", ImageFont.load_default(26))
+    return (np.asarray(picture) / 255).astype(np.float32)
 
 
 def check_extractor(extractor: Extractor, image: np.ndarray, source: Source | None = None) -> None:

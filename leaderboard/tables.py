@@ -231,8 +231,8 @@ def _explain_metrics(metrics: Sequence[str]) -> list[str]:
 
 
 def _count_values(records: list[Record], metrics: Sequence[str]) -> Iterator[str]:
-    """Yield the number of samples with a value, for each metric of an optional extra that some samples have no value of."""
-    extras = {plugin.name() for plugin in discovery.load_plugins(discovery.METRIC) if plugin.packages}
+    """Yield the number of samples with a value, for each metric of an extra or program that some samples have no value of."""
+    extras = {plugin.name() for plugin in discovery.load_plugins(discovery.METRIC) if plugin.packages or plugin.programs}
     for name in metrics:
         if name in extras:
             values = [(record["sample"], record["metrics"].get(name)) for record in records if record["status"] == "ok"]

@@ -6,7 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
 
+import numpy as np
+
 from bench.formats.pretrained import INSTALLED
+from bench.identification import face_embedding
 from bench.identification.face_embedding import FaceMetric
 from bench.types import Floats
 
@@ -30,6 +33,9 @@ class Identity(FaceMetric):
         # (H, W, 3) in [0, 1] each
         compared = self.compare(truth, estimate)
         return None if compared is None else float(compared.identified.mean())
+
+    def describe_truth(self, truth: Floats) -> str | None:
+        return f"faces in the photograph: {len(face_embedding.detect_faces(truth.astype(np.float64)))}"
 
 
 PLUGIN = Identity

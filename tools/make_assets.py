@@ -21,6 +21,7 @@ DICTIONARIES = (  # file, set of photographs, words, extractor
     ("dictionary", "01", WORDS, "sift"),
     ("public-database", "2", 128_000, "sift"),
     ("dictionary-xfeat", "01", 16_000, "xfeat"),
+    ("dictionary-aliked", "01", 16_000, "aliked"),
 )
 DEFENSES = ("none", "affine")
 SETS = ("01", "02", "12", "2", "012")  # of thirds of the photographs

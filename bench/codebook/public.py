@@ -23,6 +23,7 @@ SHIPPED = {
     "shipped": "dictionary.safetensors",
     "shipped-public": "public-database.safetensors",
     "shipped-xfeat": "dictionary-xfeat.safetensors",
+    "shipped-aliked": "dictionary-aliked.safetensors",
 }
 REFERENCES = "references"
 CLUSTERED = {"shipped-clustered": "shipped"}  # dictionaries that are clustered from the words of another one

@@ -37,8 +37,8 @@ def list_required(plugin: type[Plugin]) -> list[str]:
 
 
 def is_optional(metric: type[Metric]) -> bool:
-    """Return whether a metric needs a setting or an optional extra. Then only the runs that name it compute it."""
-    return bool(metric.packages or list_required(metric))
+    """Return whether a metric needs a setting, an optional extra or a program. Then only the runs that name it compute it."""
+    return bool(metric.packages or metric.programs or list_required(metric))
 
 
 def list_defaults(plugin: type[Plugin]) -> dict[str, Any]:

@@ -185,7 +185,7 @@ def _hash_defense(defense: Defense) -> str | None:
 
 
 def list_extra_metrics() -> tuple[Metric, ...]:
-    """Return the metrics of the optional extras that are installed; none if the variable FEATURE_PRIVACY_EXTRA_METRICS is "none".
+    """Return the metrics whose optional extra or program is installed; none if FEATURE_PRIVACY_EXTRA_METRICS is "none".
 
     A configuration names them. So a plan depends on its configuration, and not on what is installed.
 
@@ -199,8 +199,8 @@ def list_extra_metrics() -> tuple[Metric, ...]:
         raise UserError(f"{VARIABLE}={value}: must be {NO_EXTRAS}, or not set")
     if value == NO_EXTRAS:
         return ()
-    candidates = [metric for metric in discovery.load_plugins(discovery.METRIC) if metric.packages]
-    return tuple(metric() for metric in candidates if all(map(environment.is_installed, metric.packages)))
+    metrics = discovery.load_plugins(discovery.METRIC)
+    return tuple(metric() for metric in metrics if (metric.packages or metric.programs) and metric.is_installed())
 
 
 def _default_metrics() -> Iterator[Metric]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -224,7 +224,18 @@ def compute_metrics(
             )
     if image is not None and (mask := trial.images[0].foreground()) is not None:
         values |= compute_part_metrics(trial.metrics, truth, image, mask)
-    return Outcome(metrics=values, image=image, notes=notes)
+    described = () if image is None else describe_truth(trial.metrics, truth)
+    return Outcome(metrics=values, image=image, notes=(*notes, *described))
+
+
+def describe_truth(metrics: Sequence[Metric], truth: Floats) -> Iterator[str]:
+    """Yield what the metrics of images find in the photograph."""
+    for metric in metrics:
+        if metric.compares == "images":
+            with wrap_plugin_errors(f"plugin {metric.name()}"):
+                note = metric.describe_truth(truth)
+            if note is not None:
+                yield f"{metric.name()}: {note}"
 
 
 def list_views(trial: Trial) -> Floats | None:

@@ -37,10 +37,11 @@ def test_all_together_stay_under_95_megabytes():
 
 @pytest.mark.slow
 def test_dictionaries(public):
-    k, z, xfeat = (public.dictionary(name) for name in ("shipped", "shipped-public", "shipped-xfeat"))
-    assert (k.words.shape, z.words.shape, xfeat.words.shape) == ((256_000, 128), (128_000, 128), (16_000, 64))
-    assert k.photographs == xfeat.photographs
-    for words in (k, z, xfeat):
+    k, z, xfeat, aliked = (public.dictionary(name) for name in ("shipped", "shipped-public", "shipped-xfeat", "shipped-aliked"))
+    assert (k.words.shape, z.words.shape) == ((256_000, 128), (128_000, 128))
+    assert (xfeat.words.shape, aliked.words.shape) == ((16_000, 64), (16_000, 128))
+    assert k.photographs == xfeat.photographs == aliked.photographs
+    for words in (k, z, xfeat, aliked):
         assert len(np.unique(words.words, axis=0)) == len(words)
         assert words.words.any(axis=1).all()
     assert not k.photographs & z.photographs, "the attacker's database must be built from other photographs"

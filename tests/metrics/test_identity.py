@@ -87,6 +87,7 @@ def test_each_face_counts(identity: Identity, distance: IdentityDistance) -> Non
     beside = np.concatenate([ASTRONAUT, ADMIRAL], axis=1)
     exchanged = np.concatenate([ASTRONAUT, replace_face(ADMIRAL, list_other_pictures()[0][0])], axis=1)
     assert identity(beside, exchanged) == 0.5
+    assert identity.describe_truth(beside) == "faces in the photograph: 2"
     compared = identity.compare(beside, exchanged)
     assert compared is not None
     assert compared.detected.tolist() == [True, True]

@@ -1,4 +1,4 @@
-"""Metrics of optional extras: `bench run` and suites compute them, other plans do not depend on what is installed."""
+"""Metrics of optional extras and programs: `bench run` and suites compute them, other plans need not know what is installed."""
 
 import dataclasses
 import json
@@ -12,11 +12,13 @@ from fakes import FAKES, install_plugins, write_album
 from bench import cli
 from bench.core import environment
 from bench.core.errors import UserError
+from bench.identification import words
 from bench.registry import discovery
 from bench.runner import plan, records, suite
 from bench.runner.plan import build_plan, list_extra_metrics
 from defenses.none import Undefended
 from leaderboard import comparison, recipe, regression, submission
+from metrics.reads import Reads
 
 EXTRAS = ("identity", "identity-distance", "perceptual")
 COMMAND = ["run", "--defense", "none", "--attack", "sketch", "--images", "album"]
@@ -24,7 +26,8 @@ COMMAND = ["run", "--defense", "none", "--attack", "sketch", "--images", "album"
 
 @pytest.fixture
 def installed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Choose the extras as a user's installation does."""
+    """Choose the extras as a user's installation does that lacks the program of `reads`."""
+    monkeypatch.setattr(words, "find_model", lambda: None)
     for name in EXTRAS:
         metric = discovery.load_plugin(discovery.METRIC, name)
         for package in metric.packages:
@@ -46,6 +49,13 @@ def test_an_extra_that_lacks_a_package_is_left_out(installed: None, monkeypatch:
     is_installed = environment.is_installed
     monkeypatch.setattr(environment, "is_installed", lambda name: name != "dlib-bin" and is_installed(name))
     assert [metric.name() for metric in list_extra_metrics()] == ["perceptual"]
+
+
+def test_a_metric_whose_program_is_installed(installed: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = tmp_path / words.MODEL
+    model.touch()
+    monkeypatch.setattr(words, "find_model", lambda: model)
+    assert tuple(metric.name() for metric in list_extra_metrics()) == (*EXTRAS, "reads")
 
 
 @pytest.mark.slow
@@ -93,6 +103,21 @@ def test_records_with_extras(
     assert "--metric identity --metric identity-distance --metric perceptual" in command
     given = command.split()[command.split().index("--metric") : command.split().index("--seed")]
     assert run(capsys, "--out", "again", *given)["experiment_id"] == record["experiment_id"]
+
+
+@pytest.mark.slow
+def test_records_of_words(album: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """The records can be checked where the program is, and the check says why it fails where it is not."""
+    if not Reads.is_installed():
+        pytest.skip("reads needs the program tesseract 5 (apt install tesseract-ocr)")
+    record = run(capsys, "--metric", "reads", "--out", "read")
+    assert record["metrics"]["reads"] is None
+    assert "reads: words in the photograph: 0" in record["notes"]
+    assert record["metric_settings"]["reads"]["model"].startswith("sha256:")
+    assert submission.check(Path("read") / records.FILE, images=album, sample=1) == (1, [])
+    monkeypatch.setattr(words, "find_model", lambda: None)
+    _, (fault,) = submission.check(Path("read") / records.FILE, images=album, sample=1)
+    assert "Tesseract 5 with eng.traineddata is not on the PATH" in fault.message
 
 
 @pytest.mark.slow
