@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from bench.core.table import Table, to_csv, to_markdown
 from bench.runner import attack_suite
@@ -57,7 +58,6 @@ def _write_figure(sample: str, records: Sequence[Record], out: Path, provenance:
     figure.parent.mkdir(parents=True, exist_ok=True)
     original = np.asarray(Image.open(photograph))
     panels = figures.build_panels(original, records, [reconstruction_path(out, record) for record in records])
-    # Without the software's version, the same run gives the same file.
-    drawing = figures.draw(panels, f"{sample}. {tables.SEED_REMARK}")
-    metadata = {"Software": None, CHUNK: provenance}
-    drawing.savefig(figure, metadata=metadata, pil_kwargs={"compress_level": 4})
+    metadata = PngInfo()
+    metadata.add_text(CHUNK, provenance)
+    figures.draw_picture(panels, f"{sample}. {tables.SEED_REMARK}").save(figure, pnginfo=metadata, compress_level=4)

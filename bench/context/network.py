@@ -27,6 +27,7 @@ FREQUENCIES = (1.0, 2.0, 3.0, 4.0, 6.0)  # of a displacement's length on a logar
 MAX_DISTANCE = 64.0  # pixels; longer displacements are clamped
 MAX_LOG_RATIO = 8.0  # limit of a log-ratio in both directions
 HIDDEN = 64  # width of the embedding of a displacement
+BLOCK = 128  # keypoints whose arrays fit into the processor's cache
 DAMPING = 0.5  # weight of the previous message in belief propagation
 
 
@@ -139,16 +140,22 @@ class ContextModel(nn.Module):
 
         (P, m, width), (P, k, HIDDEN), (P, k) -> (P, k, m, m)
         """
-        count, m, _ = words.shape
-        keys = self.project(self.key, words)  # (P, m, s, rank)
-        near = keys.flatten(1)[neighbours].view(count, neighbours.shape[1], *keys.shape[1:])  # (P, k, m, s, rank)
-        queries, bias = self.gate_queries(words, shift), self.bias(shift)  # (P, k, m, s, rank), (P, k, s)
-        # Products of single candidates: matrix products of two by two rows are slower.
-        rows = [
-            torch.stack([self.combine(queries[:, :, own], near[:, :, other], bias) for other in range(m)], dim=-1)
-            for own in range(m)
-        ]
-        return torch.stack(rows, dim=-2)
+        keys, queries = self.key(words).flatten(1), self._spread(self.project(self.query, words))
+        blocks = zip(neighbours.split(BLOCK), shift.split(BLOCK), queries.split(BLOCK), strict=True)
+        return torch.cat([self._log_ratios_of_block(keys, *block) for block in blocks])
+
+    def _log_ratios_of_block(self, keys: Tensor, neighbours: Tensor, shift: Tensor, queries: Tensor) -> Tensor:
+        """(P, m s rank), (B, k), (B, k, HIDDEN), (B, s rank, m s) -> (B, k, m, m)"""
+        (count, k), components = neighbours.shape, self.shape.components
+        m = queries.shape[2] // components
+        near = keys.index_select(0, neighbours.flatten()).view(count, k, m, -1) * self.gate(shift)[:, :, None]
+        parts = (near.flatten(1, 2) @ queries).view(count, k, m, m, components)
+        return self.limit(parts.transpose(2, 3), self.bias(shift)[:, :, None, None])
+
+    def _spread(self, queries: Tensor) -> Tensor:
+        """Spread queries, so that a matrix product sums each component by itself. (P, m, s, rank) -> (P, s rank, m s)"""
+        spread = torch.diag_embed(queries.permute(0, 3, 1, 2))  # (P, rank, m, s, s)
+        return spread.permute(0, 3, 1, 2, 4).flatten(3).flatten(1, 2)
 
     def project(self, layer: nn.Module, words: Tensor) -> Tensor:
         """(P, m, width) -> (P, m, s, rank)"""
@@ -162,7 +169,11 @@ class ContextModel(nn.Module):
 
     def combine(self, queries: Tensor, keys: Tensor, bias: Tensor) -> Tensor:
         """Return the limited log-ratio of pairs. (..., s, rank), (..., s, rank), (..., s) -> (...)"""
-        parts = (queries * keys).sum(dim=-1) * self.shape.rank**-0.5 + bias
+        return self.limit((queries * keys).sum(dim=-1), bias)
+
+    def limit(self, products: Tensor, bias: Tensor) -> Tensor:
+        """Return the limited log-ratio of pairs from the products of their components. (..., s) twice -> (...)"""
+        parts = products * self.shape.rank**-0.5 + bias
         ratios = torch.logsumexp(parts, dim=-1) - math.log(self.shape.components)
         return MAX_LOG_RATIO * torch.tanh(ratios / MAX_LOG_RATIO)
 
@@ -187,7 +198,9 @@ class Gather(nn.Module):
         believed = torch.einsum("pm,pmw->pw", compute_probabilities(odds), words)
         messages = torch.cat([believed, state], dim=1)  # (P, 2 width)
         kernels = (self.kernels(shift) * graph.present[:, :, None]).transpose(1, 2)  # (P, kernels, k)
-        gathered = self.mix((kernels @ messages[graph.neighbours]).flatten(1))  # (P, width)
+        blocks = zip(kernels.split(BLOCK), graph.neighbours.split(BLOCK), strict=True)
+        sums = [near @ messages.index_select(0, rows.flatten()).view(*rows.shape, -1) for near, rows in blocks]
+        gathered = self.mix(torch.cat(sums).flatten(1))  # (P, width)
         state = state + self.update(torch.cat([state, gathered, believed], dim=1))
         fit = torch.einsum("pw,pmw->pm", self.fits(state), words) * words.shape[2] ** -0.5
         return odds * (1 + self.gain(state)) + fit, state
@@ -211,26 +224,27 @@ def propagate(alone: Tensor, ratios: Tensor, trust: Tensor, neighbours: Tensor, 
     -------
     (P, m)
     """
-    m = alone.shape[1]
-    excess = torch.expm1(ratios)
-    messages: Tensor | None = None  # (P, k, m)
+    # Candidates come first in all arrays, since operations along a long last axis are fast.
+    alone, excess = alone.T.contiguous(), torch.expm1(ratios).permute(2, 3, 0, 1).contiguous()  # (m, P), (m, m, P, k)
+    messages: Tensor | None = None  # (m, P, k)
     odds = alone
     for _ in range(rounds):
-        sent = odds[neighbours]  # (P, k, m) the neighbours' odds, without the message that they got from this keypoint
+        sent = odds[:, neighbours]  # (m, P, k) the neighbours' odds, without the message that they got from this keypoint
         if messages is not None:
-            received = torch.cat([messages.reshape(-1, m), messages.new_zeros(1, m)])  # the last one stands for no message
-            sent = sent - received[reverse]
+            received = nnf.pad(messages.flatten(1), (0, 1))  # the last one stands for no message
+            sent = sent - received[:, reverse]
         # Σ_s belief(s) ratio(c, s) over the neighbour's m + 1 states, none of them having ratio 1.
-        sums = (excess * compute_probabilities(sent)[:, :, None]).sum(dim=-1)
-        updated = torch.log1p(sums.clamp_min(-0.9999)) * trust[:, :, None]
+        sums = (excess * compute_probabilities(sent, dim=0)).sum(dim=1)
+        updated = torch.log1p(sums.clamp_min(-0.9999)) * trust
         messages = updated if messages is None else DAMPING * messages + (1 - DAMPING) * updated
-        odds = alone + messages.sum(dim=1)
-    return odds
+        odds = alone + messages.sum(dim=2)
+    return odds.T
 
 
-def compute_probabilities(odds: Tensor) -> Tensor:
-    """Return the probabilities of the candidates, which sum to 1 with that of none. (..., m) -> (..., m)"""
-    return torch.cat([odds, torch.zeros_like(odds[..., :1])], dim=-1).softmax(dim=-1)[..., :-1]
+def compute_probabilities(odds: Tensor, dim: int = -1) -> Tensor:
+    """Return the probabilities of the candidates along an axis, which sum to 1 with that of none. The shape stays."""
+    none = torch.zeros_like(odds.narrow(dim, 0, 1))
+    return torch.cat([odds, none], dim=dim).softmax(dim=dim).narrow(dim, 0, odds.shape[dim])
 
 
 def encode_offsets(offsets: Tensor) -> Tensor:

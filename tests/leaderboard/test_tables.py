@@ -227,3 +227,7 @@ def test_figure_has_a_panel_for_each_record(tmp_path: Path) -> None:
     for panels in (shown, shown * 3):
         figures.draw(panels, "a").savefig(tmp_path / "figure.png")
         assert (tmp_path / "figure.png").stat().st_size > 1000
+        picture = figures.draw_picture(panels, "a \udcff")  # of a name that is not UTF-8
+        assert picture.width == figures.PIXELS * min(len(panels), figures.COLUMNS)
+        black = (np.asarray(picture).max(axis=2) == 0).sum()  # mostly those of the two images
+        assert black > 2 * (figures.PIXELS - 2 * figures.MARGIN) ** 2 * (len(panels) // 3)
