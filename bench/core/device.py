@@ -43,4 +43,6 @@ def _has_bf16_products() -> bool:
     if hasattr(torch.cpu, "get_capabilities"):  # since torch 2.13
         capabilities = torch.cpu.get_capabilities()
         return bool(capabilities.get("amx_bf16") or capabilities.get("avx512_bf16"))
-    return bool(torch.cpu._is_amx_tile_supported() or torch.cpu._is_avx512_bf16_supported())
+    # Torch 2.4 has neither function: float32.
+    queries = (getattr(torch.cpu, name, None) for name in ("_is_amx_tile_supported", "_is_avx512_bf16_supported"))
+    return any(query() for query in queries if query is not None)

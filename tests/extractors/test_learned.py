@@ -27,7 +27,7 @@ from bench.formats import pretrained
 from bench.images.photographs import list_builtin
 from bench.types import Features, Floats
 
-pytest.importorskip("kornia.feature")
+pytest.importorskip("kornia", minversion="0.9")
 
 PHOTOGRAPHS = (skimage.data.astronaut, skimage.data.coffee, skimage.data.chelsea)
 ALL: list[tuple[type[Extractor], dict[str, Any]]] = [
