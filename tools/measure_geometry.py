@@ -71,7 +71,9 @@ LOCALIZED = ("none", "lines", "permutation", "ldp:epsilon=16", "lines+ldp:epsilo
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--work", type=Path, required=True, help="folder of records, reused between runs")
-    parser.add_argument("--scene", type=Path, required=True, help="the photographs of the fox, the example scene of instant-ngp")
+    parser.add_argument(
+        "--scene", type=Path, help="the photographs of the fox, the example scene of instant-ngp (default: leave this scene out)"
+    )
     args = parser.parse_args()
     args.work.mkdir(parents=True, exist_ok=True)
     pairs = [
@@ -81,8 +83,8 @@ def main() -> None:
     ]
     in_gallery = {defense: localize(defense, SMALL_GALLERY, args.work / "localization") for defense in LOCALIZED}
     served = {("lines", attack): attack_positions("lines", attack, args.work / "server", SMALL_GALLERY) for attack in SERVED}
-    photographed = f"captured:path={args.scene}"
-    in_scene = {defense: localize(defense, photographed, args.work / "scene") for defense in LOCALIZED}
+    photographed, defenses = f"captured:path={args.scene}", LOCALIZED if args.scene else ()
+    in_scene = {defense: localize(defense, photographed, args.work / "scene") for defense in defenses}
     attacked = {pair: attack_positions(*pair, args.work / "attacks") for pair in pairs}
     draw_tradeoff(attacked, in_gallery).savefig(PICTURE, dpi=110)
     results = (attacked, served, in_gallery, in_scene)
@@ -92,8 +94,10 @@ def main() -> None:
         write_attacks(served, BY_SERVER),
         LOCALIZATION,
         write_localization(in_gallery, f"Dataset `{SMALL_GALLERY}`, a rendered building"),
-        write_localization(in_scene, "Dataset `captured:path=fox/`, a photographed scene; every fifth photograph is a query"),
     ]
+    if args.scene:
+        caption = "Dataset `captured:path=fox/`, a photographed scene; every fifth photograph is a query"
+        parts.append(write_localization(in_scene, caption))
     write_page("geometry.md", "\n".join(parts), [record for some in results for each in some.values() for record in each])
 
 
@@ -126,20 +130,25 @@ def draw_tradeoff(attacked: Mapping[tuple[str, str], Sequence[Record]], localize
     figure = Figure(figsize=(9.0, 3.8), layout="constrained")
     styles = choose_styles(FAMILIES.values())
     for axes, (metric, label) in zip(figure.subplots(1, 2), {"ssim": "SSIM", "identified": "identified"}.items(), strict=True):
+        labels: dict[tuple[float, float], list[str]] = {}
         for defense, records in localized.items():
             attacks = {attack: each for (one, attack), each in attacked.items() if one == defense and attack not in REFERENCES}
             score = max(values.mean() for each in attacks.values() if len(values := list_values(each, metric)))
             recall = list_values(records, RECALL).mean()
             style = styles[FAMILIES[defense.partition(":")[0]]]
             axes.plot(recall, score, style.marker, color=style.colour, ms=7, clip_on=False)
-            axes.annotate(defense.replace(":epsilon=", ", ε = "), (recall, score), (6, 5), textcoords="offset points", fontsize=7)
+            labels.setdefault((round(recall, 2), round(score, 2)), []).append(defense.replace(":epsilon=", " ε "))
+        for point, names in labels.items():
+            axes.annotate(
+                ", ".join(names), point, (3, 5), textcoords="offset points", fontsize=7, rotation=30, rotation_mode="anchor"
+            )
         blank = list_values(attacked["lines", "blank"], metric).mean()
         axes.axhline(blank, color="0.35", lw=1, label="baseline blank")
         axes.set_xlabel("localization within 0.5 m, 5°: fraction of queries →", fontsize=9)
         axes.set_ylabel(f"{label} of the strongest attack →", fontsize=9)
         axes.spines[["top", "right"]].set_visible(False)
         axes.tick_params(labelsize=8)
-        axes.margins(x=0.25, y=0.12)
+        axes.margins(x=0.25, y=0.15)
     for family, style in styles.items():
         axes.plot([], [], style.marker, color=style.colour, label=f"hides {family}")
     figure.legend(*axes.get_legend_handles_labels(), fontsize=8, frameon=False, loc="outside lower center", ncols=5)
