@@ -335,7 +335,9 @@ def train_inverter(
     device = data.views.codes.device
     dtype = pick_dtype(device)
     torch.manual_seed(SEED)
-    module: Inverter = build_inverter(initial.module).to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+    raw = initial.module
+    assert isinstance(raw, Inverter)
+    module: Inverter = build_inverter(raw).to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def reconstructions(module: Inverter, rng: np.random.Generator) -> Tensor:
         drawn = draw_releases(data, lambda size: BATCH, context.module.shape.neighbours, rng)

@@ -196,7 +196,7 @@ def relight(example: Example, limit: float, rng: np.random.Generator) -> Example
     return dataclasses.replace(example, pixels=np.round(255 * pixels).astype(np.uint8))
 
 
-def drop_keypoints(points: EncodedRelease, fraction: float, rng: np.random.Generator) -> EncodedRelease:
+def drop_keypoints(points: Encoded, fraction: float, rng: np.random.Generator) -> Encoded:
     """Drop a fraction of the keypoints at random."""
     mask = torch.from_numpy(rng.random(len(points.image)) >= fraction)
     return dataclasses.replace(points, **{name: getattr(points, name)[mask] for name in ("values", "coordinates", "image")})
@@ -358,7 +358,7 @@ def fit(learner: Learner[Inverter], examples: Examples, idea: Idea, seconds: flo
     return learner.step * learner.training.batch
 
 
-def score_average(network: nn.Module, symmetries: Sequence[Symmetry], views: Sequence[PhotographView]) -> dict[str, float]:
+def score_average(network: Inverter, symmetries: Sequence[Symmetry], views: Sequence[PhotographView]) -> dict[str, float]:
     """Return mean SSIM and PSNR of reconstructions averaged over symmetries, as in `dia`."""
     scores = []
     for view in views:

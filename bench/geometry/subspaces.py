@@ -130,8 +130,8 @@ def _compute_scores(planes: Tensor, block: Tensor) -> Tensor:
 
     wide = block.float()
     if planes.dtype == torch.float32:  # scaled words cost less than scaled scores
-        units = torch.nn.functional.normalize(wide, dim=1)
-        foot, *axes = (planes.flatten(0, 1) @ units.T).unflatten(0, planes.shape[:2])  # (n, K') each
+        normalised = torch.nn.functional.normalize(wide, dim=1)
+        foot, *axes = (planes.flatten(0, 1) @ normalised.T).unflatten(0, planes.shape[:2])  # (n, K') each
         scores = foot.clone()  # a view would keep all products in memory
         for axis in axes:
             scores.addcmul_(axis, axis)

@@ -165,11 +165,10 @@ class _FineConvolution(torch.autograd.Function):
     def backward(context: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None]:
         x, weight = context.saved_tensors
         of_x, of_weight = context.needs_input_grad
-        first = [tensor.contiguous() for tensor in (gradient, x, weight)]
-        return (
-            _differentiate(gradient, x, weight, [True, False, False])[0] if of_x else None,
-            _differentiate(*first, [False, True, False])[1] if of_weight else None,
-        )
+        by_x = _differentiate(gradient, x, weight, [True, False, False])[0] if of_x else None
+        if not of_weight:
+            return by_x, None
+        return by_x, _differentiate(gradient.contiguous(), x.contiguous(), weight.contiguous(), [False, True, False])[1]
 
 
 def _differentiate(gradient: Tensor, x: Tensor, weight: Tensor, needed: list[bool]) -> tuple[Tensor | None, ...]:

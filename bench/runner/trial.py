@@ -22,6 +22,7 @@ from PIL import Image
 
 from bench.api import Defense, Extractor
 from bench.cache import feature_cache
+from bench.codebook.public import PUBLIC_DATABASE
 from bench.core import hashing
 from bench.core.errors import PluginError, SampleError, UserError, wrap_plugin_errors
 from bench.core.randomness import derive_generator
@@ -29,11 +30,12 @@ from bench.images import samples
 from bench.images.photographs import Source
 from bench.images.samples import ImageSource, Sample
 from bench.mechanisms import composition, protection
-from bench.registry import spec
+from bench.registry import fields, spec
 from bench.runner.other_releases import ReleasePool
 from bench.runner.plan import Experiment, Plan, select_metrics
 from bench.runner.records import EVERY_SAMPLE, Record, seal
 from bench.task_api import ExtractedImage, Outcome, ProtectedImage, Trial, execute_in_process
+from bench.threat_model import PublicDatabase
 from bench.types import Bytes, Features, Release
 
 
@@ -168,10 +170,12 @@ class TrialRunner:
 def dry_run(plan: Plan) -> None:
     """Protect one keypoint of the first readable image by each defense, to detect errors before anything is written.
 
+    The public databases of the attacks have to suit its features as well.
+
     Raises
     ------
     UserError
-        if no pair applies, or a defense refuses its configuration.
+        if no pair applies, a defense refuses its configuration, or a database is of other features.
     """
     if all(experiment.reason for experiment in plan.experiments):
         raise UserError("nothing to run: " + "; ".join(sorted({str(experiment.reason) for experiment in plan.experiments})))
@@ -184,6 +188,10 @@ def dry_run(plan: Plan) -> None:
         for experiment in {experiment.defense: experiment for experiment in plan.experiments}.values():
             with contextlib.suppress(SampleError):  # the run writes failed records for a plugin that raises
                 runner.protect(experiment, features.take(np.arange(1)), "rehearsal")
+        for attack in dict.fromkeys(experiment.attack for experiment in plan.experiments if experiment.reason is None):
+            if attack is not None and PublicDatabase in attack.needs:
+                asset = fields.list_assets(attack).get("database", PUBLIC_DATABASE)
+                plan.public.dictionary(asset).check_suits(features.descriptors, f"{asset} (of {attack.name()})")
         return
 
 

@@ -85,7 +85,7 @@ def test_table_of_words() -> None:
     ("text", "left", "expected"),
     [("station", 10, True), ("statiom", 10, True), ("stotiom", 10, False), ("station", 40, True), ("station", 44, False)],
 )
-def test_words_of_the_same_place(text: str, left: float, expected: bool) -> None:
+def test_words_at_the_same_position(text: str, left: float, expected: bool) -> None:
     """Of 50 pixels in width, moved by 30: the intersection over union is 20 / 80."""
     word = Word(text="station", box=(5, 10, 15, 50), confidence=90)
     assert words.is_among(word, [Word(text=text, box=(5, left, 15, 50), confidence=10)]) is expected

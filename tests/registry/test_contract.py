@@ -12,6 +12,9 @@ import numpy as np
 import pytest
 from fakes import draw_texture
 
+import bench
+from attacks.clustering import Clustering
+from attacks.nearest import Nearest
 from bench import testing
 from bench.api import Attack, Defense, Extractor, Metric, Privacy, View
 from bench.cache import store
@@ -28,6 +31,7 @@ from bench.registry import discovery, fields, spec
 from bench.registry.discovery import Kind
 from bench.testing import check_applicability, check_attack, check_defense, check_extractor, check_metric
 from bench.types import Descriptors, Features, Points
+from defenses.affine import Affine
 from defenses.ldp import LDP
 
 
@@ -125,6 +129,18 @@ def test_signed_words_are_refused_for_sift(plugin: type[Defense], tmp_path: Path
     words = write_dictionary(tmp_path, length=128, signed=True)
     with pytest.raises(UserError, match=r"8-bit vectors of SIFT, the words of .* have signs"):
         adapt(plugin, dictionary=words, database=words).protect(draw_features(), Public(), np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("attack", [Nearest, Clustering])
+def test_public_database_of_sift_is_refused(attack: type[Attack], tmp_path: Path, images: Path) -> None:
+    """Before the run, since an attack would compare vectors of different spaces. The control is a database of these features."""
+    words = write_dictionary(tmp_path, length=64, signed=True)
+    defense = Affine(database=words)
+    with pytest.raises(UserError, match=rf"length 64, the words of shipped-public \(of {attack.name()}\) 128"):
+        bench.run([defense], [attack()], images, extractor=Signed())
+    small = {"neighbours": 5, "others": 0} if attack is Clustering else {}
+    records = bench.run([defense], [attack(database=words, **small)], images, extractor=Signed())
+    assert {record["status"] for record in records} == {"ok"}
 
 
 REASONS = {"lattice": "does not declare 8-bit descriptors", "sparsity": "does not declare any"}
