@@ -39,7 +39,7 @@ from bench.images.photographs import list_photographs
 from bench.images.views import PhotographView, collect_views
 from bench.inversion import weights
 from bench.inversion.data import Example, Examples, Target
-from bench.inversion.encoding import CELL, EncodedRelease
+from bench.inversion.encoding import CELL, Encoded, EncodedRelease
 from bench.inversion.learner import Learner
 from bench.inversion.loss import LUMA, WEIGHT, ssim
 from bench.inversion.network import Inverter, Shape
