@@ -34,6 +34,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=17_800, help="of the common first stage, each of 8 training samples")
     parser.add_argument("--own-steps", type=int, default=4500, help="of each second stage, and of the network for positions")
     parser.add_argument("--oriented-steps", type=int, default=20_800, help="of the network for oriented descriptors")
+    parser.add_argument("--xfeat-steps", type=int, default=2600, help="of the network for XFeat")
     args = parser.parse_args()
     folders = split_photographs(args.data, args.work / "photographs")
     for file, photographs, words, extractor in DICTIONARIES:
@@ -51,6 +52,20 @@ def main() -> None:
     }
     for name, options in alone.items():
         ship(run_once(args.work / f"{name}.safetensors", "train", "--defense", "none", *given, *options))
+    crossfit = args.work / "crossfit-xfeat.safetensors"
+    run_once(crossfit, "dictionary", "build", "--images", folders["2"], "--size", 16_000, "--extractor", "xfeat")
+    both = [
+        "--defense",
+        "none",
+        "--defense",
+        "ldp:dictionary=shipped-xfeat,words=0",
+        "--extractor",
+        "xfeat",
+        "--crossfit",
+        crossfit,
+    ]
+    schedule = ["--keypoints", "250,1000", "--initial-checkpoint", initial, "--steps", args.xfeat_steps, "--rate", 3e-3]
+    ship(run_once(args.work / "inversion-xfeat.safetensors", "train", *both, *given, *schedule))
 
 
 def split_photographs(data: Path, work: Path) -> dict[str, Path]:

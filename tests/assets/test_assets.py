@@ -19,9 +19,9 @@ from defenses.ldp import LDP
 from defenses.none import Undefended
 from metrics.ssim import SSIM
 
-ORIENTED = ASSETS / "inversion-oriented.safetensors"  # for other features; not compared here
+OTHER_FEATURES = {ASSETS / f"inversion-{name}.safetensors" for name in ("oriented", "xfeat")}  # not compared here
 WORDS = ASSETS / "inversion-ldp.safetensors"  # trained longer than the others, with a context model
-NETWORKS = sorted(set(ASSETS.glob("inversion-*.safetensors")) - {ORIENTED, WORDS})
+NETWORKS = sorted(set(ASSETS.glob("inversion-*.safetensors")) - {*OTHER_FEATURES, WORDS})
 
 THIRD = 266  # photographs that the dictionary was not built from
 
@@ -68,7 +68,7 @@ def select_stages(path):
 def test_networks_have_equal_training_and_follow_the_rules(path):
     meta, expected = weights.load(path).meta, select_stages(NETWORKS[0])
     assert select_stages(path) == expected, "unequal training makes an unfair comparison"
-    assert select_stages(ORIENTED) != expected  # the control
+    assert select_stages(ASSETS / "inversion-oriented.safetensors") != expected  # the control
     assert meta["photographs"] == THIRD
     if meta["quantisation_error"] is not None:
         check_quantisation(meta["quantisation_error"]["training"], meta["quantisation_error"]["validation"])
