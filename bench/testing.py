@@ -122,7 +122,8 @@ def _check_attack(
     public = Public(quantise, scene_index=scene_index)
     store.fetch(feature_cache.KIND, "the secret", lambda: (feature_cache.to_arrays(secret), {"size": list(secret.size)}))
     mine = copy.deepcopy(secret)
-    other_secrets = [draw_features(len(secret), seed, secret.descriptors.shape[1]) for seed in range(5, 8)]
+    length, signed = secret.descriptors.shape[1], secret.codes is None
+    other_secrets = [draw_features(len(secret), seed, length, signed) for seed in range(5, 8)]
 
     def draw_others(count: int) -> Iterator[Release]:
         return (defense.protect(features, Public(), np.random.default_rng(4)) for features in other_secrets[:count])
