@@ -30,7 +30,7 @@ from bench.geometry.nearest_words import unit_rows
 from bench.identification.thumbnails import compute_thumbnail, normalize_thumbnails
 from bench.images.photographs import Source, list_photographs
 from bench.images.views import PhotographView
-from bench.inversion import weights
+from bench.inversion import network, weights
 from bench.inversion.data import assign_dictionaries
 from bench.inversion.train import check_quantisation
 from bench.settings import Asset
@@ -318,10 +318,12 @@ def test_both_networks_are_trained_and_the_attack_loads_them(
     path = trainer.train_inverter(tmp_path / "inversion-ldp.safetensors", stacked, world.unseen, meta, 1, context, initial)
     found, shipped = weights.load(path).meta, weights.load(ASSETS / path.name).meta
     assert found.keys() - {"validation"} == shipped.keys()
-    different = {"batch", "crops", "context", "photographs", "quantisation_error"}
+    different = {"batch", "crops", "context", "photographs", "quantisation_error", "shape"}
     assert {key: found[key] for key in shipped.keys() - different} == {key: shipped[key] for key in shipped.keys() - different}
+    assert found["shape"] == dataclasses.asdict(network.Shape(**shipped["shape"]))  # a later field has its default
     assert context.meta.keys() == context_weights.load(ASSETS / "context.safetensors").meta.keys()
-    monkeypatch.setattr(dia, "ASSETS", tmp_path)
+    for module in (dia, weights):
+        monkeypatch.setattr(module, "ASSETS", tmp_path)
     public = Public()
     assert dia.DIA().explain_not_applicable(LDP(), Sift(), public) is None
     release = LDP().protect(world.unseen[0].features, public, np.random.default_rng(0))
