@@ -32,6 +32,10 @@ SMALLER = {
     "dataset gallery --layout colmap --views 2 --queries 2 --out gallery/": "gallery:width=64,height=48,detail=0.1",
     "train --defense none --images photos/ --out W.safetensors --log logs/": "--steps 1 --batch 1 --widths 8,8",
     "export --images photos/ --defense affine --attack nearest --layout hloc --out recovered.h5": "--images one/",
+    "train --defense lines --images photos/ --out W.safetensors --widths 32,64,112,56 --steps 2500": (
+        "--steps 1 --batch 1 --widths 8,8"
+    ),
+    "run --defense lines --attack dia-lines:weights=W.safetensors --attack neighbourhood": "--images one/",
     "cost --markdown": "--words 1000",
 }
 # Further options of commands that take many seconds even so: an exhaustive test runs each of them by itself.
