@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bench.api import PositionAttack, View
-from bench.positions.lines import read_lines
+from bench.geometry.lines import read_lines
 from bench.positions.neighbourhood import find_densest
 from bench.types import Descriptors, Floats, Subspaces, WordSets
 

@@ -25,8 +25,8 @@ import numpy as np
 
 from bench.api import Defense, Extractor, PositionAttack, View
 from bench.codebook.public import Public
+from bench.geometry.lines import read_lines
 from bench.positions import neighbour_model
-from bench.positions.lines import read_lines
 from bench.positions.neighbourhood import recover_positions
 from bench.positions.prediction import predict_neighbours
 from bench.threat_model import PublicAssets

@@ -24,9 +24,9 @@ import numpy as np
 from bench.api import Defense, Extractor, PositionAttack, View
 from bench.codebook.public import Public
 from bench.core.errors import SampleError
+from bench.geometry.lines import read_lines
 from bench.localization import map_matching
 from bench.positions import neighbour_model
-from bench.positions.lines import read_lines
 from bench.positions.neighbourhood import recover_positions
 from bench.positions.prediction import predict_neighbours
 from bench.threat_model import PublicAssets, ServerMap

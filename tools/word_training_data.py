@@ -309,4 +309,4 @@ def encode_batch(batch: Batch, logs: Tensor) -> EncodedRelease:
     within = position - position.floor() - 0.5
     defense = torch.stack([odds, torch.full_like(odds, size)], dim=1) / 4
     values = torch.cat([candidates.view(count, size * length) * length**0.5, within, logs, defense], dim=1)
-    return EncodedRelease(values, position, batch.image, len(batch.photographs), (SIDE, SIDE))
+    return EncodedRelease(values=values, coordinates=position, image=batch.image, batch=len(batch.photographs), size=(SIDE, SIDE))

@@ -25,7 +25,6 @@ SHIPPED = {
     "shipped-xfeat": "dictionary-xfeat.safetensors",
     "shipped-aliked": "dictionary-aliked.safetensors",
 }
-PUBLIC_DATABASE = "shipped-public"  # of attacks without a field for it
 REFERENCES = "references"
 CLUSTERED = {"shipped-clustered": "shipped"}  # dictionaries that are clustered from the words of another one
 

@@ -6,6 +6,7 @@ A plain sum over candidates has few true words among many false ones. With poste
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -48,4 +49,4 @@ def encode_posteriors(release: WordSets, logs: Tensor, odds: float) -> EncodedRe
     plain = encode([release], [np.empty(0, np.float32)], release.subset_size, "posteriors")
     defense = torch.tensor([odds, release.subset_size]) / 4
     values = torch.cat([plain.values, logs, defense.expand(len(release), -1)], dim=1)
-    return EncodedRelease(values, plain.coordinates, plain.image, plain.batch, plain.size)
+    return replace(plain, values=values)

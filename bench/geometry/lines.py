@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.types import Floats
+from bench.types import Floats, Lines, Release
 
 Doubles = NDArray[np.float64]
 
@@ -32,6 +32,19 @@ class ClippedLines:
         steps = (np.arange(count) + 0.5) / count
         along = self.first[:, None] + steps * (self.last - self.first)[:, None]
         return (self.feet[:, None] + along[:, :, None] * self.along[:, None]).astype(np.float32)
+
+
+def read_lines(release: Release) -> Floats:
+    """Return the released lines. -> (N, 3)
+
+    Raises
+    ------
+    TypeError
+        if the release holds other positions.
+    """
+    if not isinstance(release.positions, Lines):
+        raise TypeError(f"expected Lines, got {type(release.positions).__name__}")
+    return release.positions.lines
 
 
 def clip_lines(lines: Floats, size: tuple[int, int]) -> ClippedLines:

@@ -89,9 +89,8 @@ def _find_candidates(feet: Doubles, frames: Doubles, words: Words | Floats, coun
     device = pick_device()
     dtype = pick_dtype(device)
     exact = np.concatenate([feet[:, None], frames], axis=1).transpose(1, 0, 2)  # (1 + dim, n, D)
-    coarse = torch.from_numpy(exact).to(dtype).contiguous()
+    coarse = torch.from_numpy(exact).to(dtype)
     error = _bound_error(exact, coarse.double().numpy(), dtype, words.dtype)  # (n,)
-    coarse[0] *= 2  # exact
     planes, allowed = coarse.to(device), torch.from_numpy(2 * error).float().to(device)[:, None]
     size = max(1, min(GROUP, len(words) // (GROUPS * count)))
     # The highest scores so far, one per group. The lowest of them is a lower bound of the count-th highest score.
@@ -125,24 +124,16 @@ def _select_at_least(least: Tensor, start: int, groups: Tensor, maxima: Tensor) 
 
 
 def _compute_scores(planes: Tensor, block: Tensor) -> Tensor:
-    """Return approximate scores 2 p·u + |B u|², from 2 p and B. (1 + dim, n, D), (K', D) -> (n, K') float32"""
+    """Return approximate scores 2 p·u + |B u|². (1 + dim, n, D), (K', D) -> (n, K') float32"""
     import torch
 
-    wide = block.float()
-    if planes.dtype == torch.float32:  # scaled words cost less than scaled scores
-        normalised = torch.nn.functional.normalize(wide, dim=1)
-        foot, *axes = (planes.flatten(0, 1) @ normalised.T).unflatten(0, planes.shape[:2])  # (n, K') each
-        scores = foot.clone()  # a view would keep all products in memory
-        for axis in axes:
-            scores.addcmul_(axis, axis)
-        return scores
-    scale = wide.square().sum(dim=1).rsqrt()  # (K',) words are multiplied unscaled: bytes are exact in bf16
+    scale = block.float().square().sum(dim=1).rsqrt()  # (K',) words are multiplied unscaled: bytes are exact in bf16
     products = (planes.flatten(0, 1) @ block.to(planes.dtype).T).unflatten(0, planes.shape[:2])  # (1 + dim, n, K')
     scores = torch.zeros(products.shape[1:], device=planes.device)
     for product in products[1:]:  # one at a time, so that a float32 copy stays in the cache
         wide = product.float()
         scores.addcmul_(wide, wide)
-    return scores.mul_(scale).add_(products[0]).mul_(scale)
+    return scores.mul_(scale).add_(products[0], alpha=2).mul_(scale)
 
 
 def _bound_error(exact: Doubles, rounded: Doubles, dtype: torch.dtype, words: np.dtype) -> Doubles:
@@ -165,7 +156,7 @@ def _bound_error(exact: Doubles, rounded: Doubles, dtype: torch.dtype, words: np
     import torch
 
     r = torch.finfo(dtype).eps / 2
-    word = 0.0 if words == np.uint8 and dtype == torch.bfloat16 else r  # |u' − u|
+    word = 0.0 if words == np.uint8 else r  # |u' − u|
     s = exact.shape[2] * 2.0**-23
     foot = np.linalg.norm(exact[0], axis=1)  # (n,) |p|
     off = rounded - exact

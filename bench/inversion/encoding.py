@@ -10,14 +10,14 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import singledispatch
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, Self
 
 import numpy as np
 
 from bench.api import Defense
-from bench.geometry.lines import clip_lines
+from bench.geometry.lines import clip_lines, read_lines
 from bench.settings import Between, OneOf
-from bench.types import Descriptors, Floats, Lines, Release, Subspaces, WordSets
+from bench.types import Descriptors, Floats, Release, Subspaces, WordSets
 
 if TYPE_CHECKING:
     import torch
@@ -28,47 +28,40 @@ DIRECTIONS = 16  # number of fixed directions that are projected onto subspaces
 TYPICAL_SCALE = 4.0  # pixels
 
 
-@dataclass(frozen=True, eq=False)
-class EncodedRelease:
-    """The keypoints of a batch of B releases, P in all."""
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Encoded:
+    """A batch of B releases, P keypoints in all."""
 
     values: Tensor  # (P, F) float32
-    coordinates: Tensor  # (P, 2) float32, column and row in cells
     image: Tensor  # (P,) int64, index in the batch
     batch: int  # B
     size: tuple[int, int]  # H, W in pixels
-    weights: Tensor | None = None  # (P,) of each keypoint's embedding; None: 1
 
     @property
     def grid(self) -> tuple[int, int]:
         """Rows and columns of cells; the last ones may lie partly outside the image."""
         return math.ceil(self.size[0] / CELL), math.ceil(self.size[1] / CELL)
 
-    def to(self, device: torch.device) -> EncodedRelease:
+    def to(self, device: torch.device) -> Self:
         moved = {name: value.to(device) for name, value in vars(self).items() if hasattr(value, "to")}
         return replace(self, **moved)
 
 
-@dataclass(frozen=True, eq=False)
-class EncodedLines:
-    """The lines of a batch of B releases, P in all."""
+@dataclass(frozen=True, kw_only=True, eq=False)
+class EncodedRelease(Encoded):
+    """A batch of releases of points."""
 
-    values: Tensor  # (P, F) float32, with zeros for the position within the cell
+    coordinates: Tensor  # (P, 2) float32, column and row in cells
+    weights: Tensor | None = None  # (P,) of each keypoint's embedding; None: 1
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class EncodedLines(Encoded):
+    """A batch of releases of lines. The position within the cell is zero in `values`."""
+
     samples: Tensor  # (P, S, 2) float32, column and row in cells of points on each line
-    image: Tensor  # (P,) int64, index in the batch
     truth: Tensor | None  # (P,) int64, the sample that is nearest to the keypoint; None outside training
     within: int  # column of `values` where the position within the cell starts
-    batch: int  # B
-    size: tuple[int, int]  # H, W in pixels
-
-    @property
-    def grid(self) -> tuple[int, int]:
-        """Rows and columns of cells, as of `EncodedRelease`."""
-        return math.ceil(self.size[0] / CELL), math.ceil(self.size[1] / CELL)
-
-    def to(self, device: torch.device) -> EncodedLines:
-        moved = {name: value.to(device) for name, value in vars(self).items() if hasattr(value, "to")}
-        return replace(self, **moved)
 
     def pick_points(self, coordinates: Tensor, weights: Tensor) -> EncodedRelease:
         """Return k keypoints of each line at (P, k, 2) cells, with (P, k) weights."""
@@ -77,10 +70,9 @@ class EncodedLines:
         within = slice(self.within, self.within + 2)
         values[:, within] = points - points.floor() - 0.5
         image = self.image.repeat_interleave(coordinates.shape[1])
-        return EncodedRelease(values, points, image, self.batch, self.size, weights.flatten())
-
-
-Encoded = EncodedRelease | EncodedLines
+        return EncodedRelease(
+            values=values, coordinates=points, image=image, batch=self.batch, size=self.size, weights=weights.flatten()
+        )
 
 
 # Network input for a keypoint. "released": the unchanged release, stacked as in the paper (m words in order, or a random origin
@@ -192,7 +184,7 @@ def encode(releases: list[Release], settings: list[Floats], slots: int, encoding
         coordinates.append(position)
         image.append(np.full(len(release), number))
     rows, cells, index = (torch.from_numpy(np.concatenate(parts)) for parts in (values, coordinates, image))
-    return EncodedRelease(rows, cells, index, len(releases), (height, width))
+    return EncodedRelease(values=rows, coordinates=cells, image=index, batch=len(releases), size=(height, width))
 
 
 def encode_lines(
@@ -226,27 +218,19 @@ def encode_lines(
     cells = (np.clip(np.concatenate(points), 0, limit) / CELL).astype(np.float32)
     within = values[0].shape[1] - len(settings[0]) - _encode_frames(releases[0]).shape[1] - 2
     return EncodedLines(
-        torch.from_numpy(np.concatenate(values)),
-        torch.from_numpy(cells),
-        torch.from_numpy(np.concatenate(image)),
-        torch.from_numpy(np.concatenate(truth)) if truth else None,
-        within,
-        len(releases),
-        (height, width),
+        values=torch.from_numpy(np.concatenate(values)),
+        samples=torch.from_numpy(cells),
+        image=torch.from_numpy(np.concatenate(image)),
+        truth=torch.from_numpy(np.concatenate(truth)) if truth else None,
+        within=within,
+        batch=len(releases),
+        size=(height, width),
     )
 
 
 def sample_lines(release: Release, count: int) -> Floats:
-    """Return that many points on the part of each line in the image, equally far from each other. -> (N, count, 2) pixels
-
-    Raises
-    ------
-    TypeError
-        if the release holds other positions.
-    """
-    if not isinstance(release.positions, Lines):
-        raise TypeError(f"expected Lines, got {type(release.positions).__name__}")
-    return clip_lines(release.positions.lines, release.size).sample(count)
+    """Return that many points on the part of each line in the image, equally far from each other. -> (N, count, 2) pixels"""
+    return clip_lines(read_lines(release), release.size).sample(count)
 
 
 def _encode_rows(release: Release, condition: Floats, within: Floats, slots: int, encoding: Encoding) -> Floats:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 import torch.nn.functional as nnf
@@ -63,7 +62,7 @@ class Inverter(nn.Module):
         self.down = nn.ModuleList(nn.Sequential(conv_norm(narrow, wide, stride=2), Residual(wide)) for narrow, wide in pairs)
         self.up = nn.ModuleList(Up(wide, narrow) for narrow, wide in reversed(pairs))
         self.narrow = nn.Conv2d(first, shape.last, 1)
-        self.refine = conv_norm(shape.last, shape.last, convolution=FineConv2d)
+        self.refine = conv_norm(shape.last, shape.last)
         self.paint = nn.Conv2d(shape.last, 3 * (CELL // 2) ** 2, 3, padding=1)
 
     def forward(self, points: EncodedRelease) -> Tensor:
@@ -144,42 +143,9 @@ class Inverter(nn.Module):
         return summed + self.alone(torch.cat([within, defense, none.clamp(min=MIN_LOG_POSTERIOR) / 4], dim=1))
 
 
-class FineConv2d(nn.Conv2d):
-    """A 3 x 3 convolution without bias, of few channels at a high resolution."""
-
-    def forward(self, x: Tensor) -> Tensor:
-        if self.training and x.device.type == "cpu" and not torch.is_autocast_enabled("cpu"):
-            return _FineConvolution.apply(x, self.weight)
-        return super().forward(x)
-
-
-class _FineConvolution(torch.autograd.Function):
-    """Computes the gradient of the weights in float32 on a CPU with channels first. Channels last take twice as long."""
-
-    @staticmethod
-    def forward(context: Any, x: Tensor, weight: Tensor) -> Tensor:
-        context.save_for_backward(x, weight)
-        return nnf.conv2d(x, weight, padding=1)
-
-    @staticmethod
-    def backward(context: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None]:
-        x, weight = context.saved_tensors
-        of_x, of_weight = context.needs_input_grad
-        by_x = _differentiate(gradient, x, weight, [True, False, False])[0] if of_x else None
-        if not of_weight:
-            return by_x, None
-        return by_x, _differentiate(gradient.contiguous(), x.contiguous(), weight.contiguous(), [False, True, False])[1]
-
-
-def _differentiate(gradient: Tensor, x: Tensor, weight: Tensor, needed: list[bool]) -> tuple[Tensor | None, ...]:
-    """Return the needed gradients of a 3 x 3 convolution: of x, of the weights, and of the bias."""
-    one = [1, 1]
-    return torch.ops.aten.convolution_backward(gradient, x, weight, None, one, one, one, False, [0, 0], 1, needed)
-
-
-def conv_norm(inputs: int, outputs: int, stride: int = 1, convolution: type[nn.Conv2d] = nn.Conv2d) -> nn.Sequential:
+def conv_norm(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
     return nn.Sequential(
-        convolution(inputs, outputs, 3, stride=stride, padding=1, bias=False),
+        nn.Conv2d(inputs, outputs, 3, stride=stride, padding=1, bias=False),
         nn.BatchNorm2d(outputs),
         nn.ReLU(inplace=True),
     )

@@ -3,8 +3,8 @@
 Muon (Jordan et al., 2024; Liu et al., arXiv 2502.16982) updates a matrix by the orthogonal matrix nearest to its averaged
 gradient, so that the update has equal length in all directions. A convolution counts as a matrix of outputs by inputs.
 
-`torch.optim.Muon` is the same, but always computes in bf16. Without hardware for bf16 that is ten times slower than float32, and
-takes more time than the rest of a step.
+`torch.optim.Muon` is the same, but always computes in bf16. Without hardware for bf16 that takes more time than the
+rest of a step, and float32 a small part of it.
 """
 
 from __future__ import annotations

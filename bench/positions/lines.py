@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.types import Floats, Lines, Release
+from bench.types import Floats, Lines
 
 
 def draw_lines(keypoints: Floats, angles: NDArray[np.float64]) -> Lines:
@@ -13,16 +13,3 @@ def draw_lines(keypoints: Floats, angles: NDArray[np.float64]) -> Lines:
     normals = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     offsets = -(normals * keypoints).sum(axis=1)
     return Lines(lines=np.column_stack([normals, offsets]).astype(np.float32))
-
-
-def read_lines(release: Release) -> Floats:
-    """Return the released lines. -> (N, 3)
-
-    Raises
-    ------
-    TypeError
-        if the release holds other positions.
-    """
-    if not isinstance(release.positions, Lines):
-        raise TypeError(f"expected Lines, got {type(release.positions).__name__}")
-    return release.positions.lines

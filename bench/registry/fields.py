@@ -9,7 +9,7 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from bench.api import Metric, Plugin
+from bench.api import Attack, Metric, Plugin
 from bench.core.exact import Exact
 from bench.registry.composed import Composed
 from bench.settings import Asset
@@ -34,6 +34,11 @@ def list_required(plugin: type[Plugin]) -> list[str]:
     """Return the names of the fields without a default."""
     fields = dataclasses.fields(plugin)  # type: ignore[arg-type]
     return [field.name for field in fields if field.default is dataclasses.MISSING]
+
+
+def name_public_database(attack: Attack) -> str:
+    """Return the public database that an attack searches: that of its field `database` if it has one."""
+    return list_assets(attack).get("database", "shipped-public")
 
 
 def is_optional(metric: type[Metric]) -> bool:

@@ -22,7 +22,6 @@ from PIL import Image
 
 from bench.api import Defense, Extractor
 from bench.cache import feature_cache
-from bench.codebook.public import PUBLIC_DATABASE
 from bench.core import hashing
 from bench.core.errors import PluginError, SampleError, UserError, wrap_plugin_errors
 from bench.core.randomness import derive_generator
@@ -190,7 +189,7 @@ def dry_run(plan: Plan) -> None:
                 runner.protect(experiment, features.take(np.arange(1)), "rehearsal")
         for attack in dict.fromkeys(experiment.attack for experiment in plan.experiments if experiment.reason is None):
             if attack is not None and PublicDatabase in attack.needs:
-                asset = fields.list_assets(attack).get("database", PUBLIC_DATABASE)
+                asset = fields.name_public_database(attack)
                 plan.public.dictionary(asset).check_suits(features.descriptors, f"{asset} (of {attack.name()})")
         return
 

@@ -13,7 +13,7 @@ import numpy as np
 from bench import scene_views
 from bench.api import Attack, Dataset, Defense, Extractor, ImageAttack, LocalMetric, Metric, PositionAttack, Selection, View
 from bench.cache import attack_cache
-from bench.codebook.public import PUBLIC_DATABASE, Public
+from bench.codebook.public import Public
 from bench.codebook.true_words import find_true_candidates, find_true_words
 from bench.core.errors import SampleError, UserError, wrap_plugin_errors
 from bench.images import samples
@@ -144,7 +144,7 @@ class Reconstruction(Task):
 def offer_knowledge(attack: Attack, defense: Defense, public: Public) -> dict[type[Knowledge], Callable[[], Knowledge]]:
     """Return a loader for each kind of knowledge, except releases of that defense and the server's map."""
     databases = fields.list_assets(defense)
-    own = fields.list_assets(attack).get("database", PUBLIC_DATABASE)
+    own = fields.name_public_database(attack)
     offers: dict[type[Knowledge], Callable[[], Knowledge]] = {
         PublicDatabase: lambda: PublicDatabase(words=public.dictionary(own).words),
         PublicAssets: lambda: PublicAssets(assets=public),

@@ -1,7 +1,9 @@
 """Synthetic plugins and photographs for tests."""
 
 import dataclasses
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -121,3 +123,21 @@ def check_plan(plan: Plan) -> Plan:
     """Dry-run a plan and return it."""
     dry_run(plan)
     return plan
+
+
+@contextmanager
+def interrupted_training(after: int) -> Iterator[None]:
+    """Interrupt the training inside by Ctrl-C after that many steps, and check that it was interrupted."""
+    from bench.inversion import train
+
+    advance, steps = train._Trainer._advance, itertools.count()
+
+    def interrupt(self: Any, *given: Any) -> float:
+        if next(steps) == after:
+            raise KeyboardInterrupt
+        return advance(self, *given)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(train._Trainer, "_advance", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            yield

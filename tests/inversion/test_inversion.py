@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from fakes import interrupted_training
 from skimage.metrics import structural_similarity
 
 from bench.cli import main
@@ -172,9 +173,9 @@ def test_settings_are_encoded_by_their_supported_range():
 
 def scatter(net, values, coordinates, size=(64, 48)):
     with torch.inference_mode():
-        return net.scatter(EncodedRelease(values, coordinates, torch.zeros(len(values), dtype=torch.int64), 1, size))[
-            0
-        ]  # (C, H/4, W/4)
+        image = torch.zeros(len(values), dtype=torch.int64)
+        points = EncodedRelease(values=values, coordinates=coordinates, image=image, batch=1, size=size)
+        return net.scatter(points)[0]  # (C, H/4, W/4)
 
 
 @pytest.mark.parametrize("patch", [5, 6])
@@ -250,18 +251,8 @@ def test_a_resumed_training_is_the_same_training(defense, sources, tmp_path, mon
     plan = build_plan(sources, targets=[fix(defense)], training=TINY)
     whole = train(plan, tmp_path / "whole.safetensors")
     # Interrupt the second one after its third step, which is lost.
-    advance, steps = module._Trainer._advance, []
-
-    def interrupted(self, *given):
-        if len(steps) == 3:
-            raise KeyboardInterrupt
-        steps.append(1)
-        return advance(self, *given)
-
-    monkeypatch.setattr(module._Trainer, "_advance", interrupted)
-    with pytest.raises(KeyboardInterrupt):
+    with interrupted_training(after=3):
         train(plan, tmp_path / "parts.safetensors")
-    monkeypatch.setattr(module._Trainer, "_advance", advance)
     parts = train(plan, tmp_path / "parts.safetensors")
     a, b = weights.load(tmp_path / "whole.safetensors"), weights.load(tmp_path / "parts.safetensors")
     assert a.digest == b.digest

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from fakes import interrupted_training
 
 from attacks.dia_lines import DIALines
 from bench.cli import main
@@ -178,18 +179,8 @@ def test_a_resumed_training_is_the_same_training(tmp_path: Path, monkeypatch: py
 
     monkeypatch.setattr(module, "CHECKPOINT_EVERY", 2)
     whole = train(build_plan(), tmp_path / "whole.safetensors")
-    advance, steps = module._Trainer._advance, []
-
-    def interrupted(self, *given):  # type: ignore[no-untyped-def]
-        if len(steps) == 3:
-            raise KeyboardInterrupt
-        steps.append(1)
-        return advance(self, *given)
-
-    monkeypatch.setattr(module._Trainer, "_advance", interrupted)
-    with pytest.raises(KeyboardInterrupt):
+    with interrupted_training(after=3):
         train(build_plan(), tmp_path / "parts.safetensors")
-    monkeypatch.setattr(module._Trainer, "_advance", advance)
     parts = train(build_plan(), tmp_path / "parts.safetensors")
     assert weights.load(tmp_path / "whole.safetensors").digest == weights.load(tmp_path / "parts.safetensors").digest
     assert whole["validation"] == parts["validation"]
