@@ -1,16 +1,17 @@
 """Rebuilds the files of `bench/assets` from a folder with `train/`, `tune.txt` and `test.txt`. Takes hours; can be resumed.
 
-The photographs of `train/` that are in neither list are split by name into three thirds. The dictionary is built from the first
-two thirds, the attacker's public database from the last. All networks start from one that was trained on raw descriptors of all
-photographs. They are then trained equally long for their own releases, on the last third, which is not part of the dictionary.
-Two networks start from random weights: for positions alone, and for raw oriented descriptors. `train_word_attackers.py` trains
-the attackers of word sets afterwards.
+The photographs of `train/` that are in neither list are split by name into three thirds. The dictionaries are built from the
+first two thirds, the attacker's public database from the last. A network that reads releases is trained on photographs that its
+dictionary was not built from: those of the last third, or all with a second dictionary that is built from the last third. Most
+networks start from one that was trained on raw upright descriptors of all photographs. `train_word_attackers.py` trains the
+attackers of word sets of upright SIFT afterwards.
 """
 
 from __future__ import annotations
 
 import argparse
 import shutil
+from dataclasses import dataclass
 from pathlib import Path
 
 from bench.cli import main as bench
@@ -23,49 +24,124 @@ DICTIONARIES = (  # file, set of photographs, words, extractor
     ("dictionary-xfeat", "01", 16_000, "xfeat"),
     ("dictionary-aliked", "01", 16_000, "aliked"),
 )
-DEFENSES = ("none", "affine")
+CROSSFIT = (  # dictionaries for photographs that a shipped dictionary was built from; not shipped
+    ("crossfit-xfeat", "2", 16_000, "xfeat"),
+    ("crossfit-aliked", "2", 16_000, "aliked"),
+)
 SETS = ("01", "02", "12", "2", "012")  # of thirds of the photographs
+NARROW = "32,64,112,56"  # widths
+
+
+@dataclass(frozen=True, kw_only=True)
+class Training:
+    """A network. It starts from the network of `initial`, or from random weights."""
+
+    file: str
+    defenses: tuple[str, ...]
+    steps: int
+    rate: float = 3e-3
+    photographs: str = "012"
+    initial: str | None = "inversion-none"
+    widths: str | None = None
+    options: tuple[str, ...] = ()
+    crossfit: str | None = None
+
+
+FIRST = Training(file="start", defenses=("none",), steps=17_800, rate=4e-3, initial=None)  # the common stage, not shipped
+LEARNED = ("--keypoints", "250,1000", "--extractor")
+ORIENTED = ("--extractor", "sift:upright=false")
+ALIKED = "aliked:detection_threshold=0"
+TRAININGS = (
+    Training(file="inversion-none", defenses=("none",), steps=4500, rate=2e-3, photographs="2", initial="start"),
+    Training(file="inversion-affine", defenses=("affine",), steps=4500, rate=2e-3, photographs="2", initial="start"),
+    Training(
+        file="inversion-lifting",
+        defenses=("affine:lifting=random", "affine:lifting=adversarial"),
+        steps=2600,
+        photographs="2",
+        initial="inversion-affine",
+        widths=NARROW,
+    ),
+    Training(file="positions", defenses=("none",), steps=4500, rate=4e-3, initial=None, options=("--encoding", "positions")),
+    Training(file="inversion-oriented", defenses=("none",), steps=20_800, rate=4e-3, initial=None, options=ORIENTED),
+    *(
+        Training(
+            file=f"inversion-oriented-{defense}",
+            defenses=(defense,),
+            steps=2600,
+            photographs="2",
+            initial="inversion-oriented",
+            widths=NARROW,
+            options=ORIENTED,
+        )
+        for defense in ("affine", "ldp")
+    ),
+    Training(
+        file="inversion-xfeat",
+        defenses=("none", "ldp:dictionary=shipped-xfeat,words=0"),
+        steps=2600,
+        options=(*LEARNED, "xfeat"),
+        crossfit="crossfit-xfeat",
+    ),
+    Training(
+        file="inversion-xfeat-affine",
+        defenses=("affine:database=shipped-xfeat",),
+        steps=2600,
+        widths=NARROW,
+        options=(*LEARNED, "xfeat"),
+        crossfit="crossfit-xfeat",
+    ),
+    Training(
+        file="positions-xfeat",
+        defenses=("none",),
+        steps=1500,
+        rate=4e-3,
+        initial=None,
+        widths="24,32,48,48",
+        options=(*LEARNED, "xfeat", "--encoding", "positions"),
+    ),
+    Training(
+        file="inversion-aliked",
+        defenses=("none", "ldp:dictionary=shipped-aliked,words=0"),
+        steps=2600,
+        widths="32,48,64,64",
+        options=(*LEARNED, ALIKED),
+        crossfit="crossfit-aliked",
+    ),
+    Training(file="line-inversion", defenses=("lines", "permutation"), steps=3000, widths=NARROW),
+)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--work", type=Path, required=True, help="folder of finished files, reused between runs")
-    parser.add_argument("--steps", type=int, default=17_800, help="of the common first stage, each of 8 training samples")
-    parser.add_argument("--own-steps", type=int, default=4500, help="of each second stage, and of the network for positions")
-    parser.add_argument("--oriented-steps", type=int, default=20_800, help="of the network for oriented descriptors")
-    parser.add_argument("--xfeat-steps", type=int, default=2600, help="of the network for XFeat")
+    parser.add_argument("--fraction", type=float, default=1.0, help="of the steps of each training, for a test")
     args = parser.parse_args()
     folders = split_photographs(args.data, args.work / "photographs")
-    for file, photographs, words, extractor in DICTIONARIES:
+    for file, photographs, words, extractor in (*DICTIONARIES, *CROSSFIT):
         build = "dictionary", "build", "--images", folders[photographs], "--size", words, "--extractor", extractor
-        ship(run_once(args.work / f"{file}.safetensors", *build))
-    unseen = ["--validation", folders["tune"]]
-    given = ["--images", folders["012"], *unseen]
-    initial = run_once(args.work / "start.safetensors", "train", "--defense", "none", *given, "--steps", args.steps)
-    for name in DEFENSES:
-        own = ["--images", folders["2"], *unseen, "--initial-checkpoint", initial, "--steps", args.own_steps, "--rate", 2e-3]
-        ship(run_once(args.work / f"inversion-{name}.safetensors", "train", "--defense", name, *own))
-    alone = {
-        "positions": ["--encoding", "positions", "--steps", args.own_steps],
-        "inversion-oriented": ["--extractor", "sift:upright=false", "--steps", args.oriented_steps],
-    }
-    for name, options in alone.items():
-        ship(run_once(args.work / f"{name}.safetensors", "train", "--defense", "none", *given, *options))
-    crossfit = args.work / "crossfit-xfeat.safetensors"
-    run_once(crossfit, "dictionary", "build", "--images", folders["2"], "--size", 16_000, "--extractor", "xfeat")
-    both = [
-        "--defense",
-        "none",
-        "--defense",
-        "ldp:dictionary=shipped-xfeat,words=0",
-        "--extractor",
-        "xfeat",
-        "--crossfit",
-        crossfit,
-    ]
-    schedule = ["--keypoints", "250,1000", "--initial-checkpoint", initial, "--steps", args.xfeat_steps, "--rate", 3e-3]
-    ship(run_once(args.work / "inversion-xfeat.safetensors", "train", *both, *given, *schedule))
+        run_once(args.work / f"{file}.safetensors", *build)
+    for file, *_ in DICTIONARIES:
+        ship(args.work / f"{file}.safetensors")
+    train(FIRST, folders, args.work, args.fraction)
+    for training in TRAININGS:
+        ship(train(training, folders, args.work, args.fraction))
+
+
+def train(training: Training, folders: dict[str, Path], work: Path, fraction: float) -> Path:
+    """Train a network, unless its file exists."""
+    words: list[object] = ["--images", folders[training.photographs], "--validation", folders["tune"], *training.options]
+    for defense in training.defenses:
+        words += ["--defense", defense]
+    if training.initial:
+        words += ["--initial-checkpoint", work / f"{training.initial}.safetensors"]
+    if training.widths:
+        words += ["--widths", training.widths]
+    if training.crossfit:
+        words += ["--crossfit", work / f"{training.crossfit}.safetensors"]
+    steps = max(1, round(fraction * training.steps))
+    return run_once(work / f"{training.file}.safetensors", "train", *words, "--steps", steps, "--rate", training.rate)
 
 
 def split_photographs(data: Path, work: Path) -> dict[str, Path]:

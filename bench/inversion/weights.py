@@ -150,13 +150,13 @@ def initialise_from(fresh: Inverter | LineInverter, trained: Inverter | LineInve
     independent slots. The other slots and the settings get weight zero. All other layers are copied. If the raw descriptors have
     another length, they are other features: the first layer remains as it is.
 
-    A network that reads lines takes its inversion network from one that reads points. If its levels are narrower, it takes the
-    first channels of each.
+    If the levels are narrower, they take the first channels of each level of `trained`. A network that reads lines takes its
+    inversion network from one that reads points.
 
     Raises
     ------
     UserError
-        if the sizes differ, or `trained` reads neither such releases nor raw descriptors.
+        if a level is wider, or `trained` reads neither such releases nor raw descriptors.
     """
     import torch
 
@@ -170,18 +170,18 @@ def initialise_from(fresh: Inverter | LineInverter, trained: Inverter | LineInve
             parts = trained.state_dict().items()
             fresh.load_state_dict({k: v for k, v in parts if not k.startswith("inverter.")}, strict=False)
         elif isinstance(fresh, LineInverter):
-            _copy_weights(fresh.inverter, trained, candidates, narrower=True)
+            _copy_weights(fresh.inverter, trained, candidates)
         else:
             _copy_weights(fresh, trained, candidates)
 
 
-def _copy_weights(fresh: Inverter, trained: Inverter, candidates: int, narrower: bool = False) -> None:
+def _copy_weights(fresh: Inverter, trained: Inverter, candidates: int) -> None:
     first = "embed.0.weight"
     old, new = trained.state_dict(), fresh.state_dict()
-    if narrower and len(fresh.shape.widths) == len(trained.shape.widths):
+    if len(fresh.shape.widths) == len(trained.shape.widths):
         old = {name: value[tuple(map(slice, new[name].shape))] if name != first else value for name, value in old.items()}
     if any(old[name].shape != value.shape for name, value in new.items() if name != first):
-        raise UserError("--initial-checkpoint: that network has other sizes; pass a network with equal --widths")
+        raise UserError("--initial-checkpoint: that network has other sizes; pass equal or narrower --widths")
     for name in new.keys() - {first}:
         new[name].copy_(old[name])
     length = old[first].shape[1] - 2  # columns of the descriptor; the last two are the position within the cell

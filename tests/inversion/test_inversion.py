@@ -313,10 +313,16 @@ def test_a_network_initialised_from_one_for_raw_descriptors_gives_the_same_image
     "shape", [Shape(inputs=2), Shape(inputs=3 * 128 + 3), Shape(inputs=4 * 128 + 3, candidates=4, length=128)], ids=str
 )
 def test_a_network_initialised_from_one_for_the_same_releases_is_equal(shape):
-    """All slots and settings are copied."""
+    """All slots and settings are copied. Narrower levels take the first channels."""
     trained, fresh = Inverter(shape), Inverter(shape)
     weights.initialise_from(fresh, trained, max(1, shape.candidates))
     assert all(torch.equal(value, fresh.state_dict()[name]) for name, value in trained.state_dict().items())
+    narrow = Inverter(dataclasses.replace(shape, widths=(32, 64, 56, 48)))
+    weights.initialise_from(narrow, trained, max(1, shape.candidates))
+    for name, value in narrow.state_dict().items():
+        assert torch.equal(value, trained.state_dict()[name][tuple(map(slice, value.shape))])
+    with pytest.raises(UserError, match="other sizes"):
+        weights.initialise_from(trained, narrow, max(1, shape.candidates))
     other = Inverter(dataclasses.replace(shape, inputs=2 * 128 + 3, candidates=0, length=0))  # of fewer slots
     with pytest.raises(UserError, match="is for other releases"):
         weights.initialise_from(other, trained, 1)
