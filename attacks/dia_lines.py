@@ -33,7 +33,7 @@ from bench.settings import Asset
 from bench.threat_model import PublicAssets
 from bench.types import Descriptors, Floats, Subspaces, WordSets
 
-SHIPPED = {"shipped": "line-inversion-*.safetensors"}
+SHIPPED = {"shipped": "line-inversion*.safetensors"}
 
 
 @dataclass(frozen=True, kw_only=True)
