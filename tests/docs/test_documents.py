@@ -37,6 +37,11 @@ SMALLER = {
     ),
     "run --defense lines --attack dia-lines:weights=W.safetensors --attack neighbourhood": "--images one/",
     "cost --markdown": "--words 1000",
+    "dictionary build --images other-photos/ --extractor xfeat --size 16000 --out words.safetensors": "--size 1600",
+    "train --images other-photos/ --extractor xfeat --defense none --out raw.safetensors": "--steps 1 --batch 1 --widths 8,8",
+    "train --images other-photos/ --extractor xfeat --defense none --encoding positions --out positions.safetensors": (
+        "--steps 1 --batch 1 --widths 8,8"
+    ),
 }
 # Further options of commands that take many seconds even so: an exhaustive test runs each of them by itself.
 LONG = {
@@ -181,6 +186,7 @@ def workspace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     write_album(tmp_path / "photos", 3)
     write_album(tmp_path / "one", 1)
     write_album(tmp_path / "unseen", 3, first=6)
+    write_album(tmp_path / "other-photos", 3, first=3)
     write_album(tmp_path / "megadepth", 3, first=9)
     monkeypatch.chdir(tmp_path)
     assert cli.main(shlex.split("run --defense none --attack keypoints --images photos/ --out runs/x")) == 0
