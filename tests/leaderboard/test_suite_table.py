@@ -25,10 +25,20 @@ DIFFERENCES = np.array([-0.02, 0.01, 0.0, 0.02, -0.01, 0.0])  # between photogra
 SCORES = {"blank": 0.1, "keypoints": 0.2, "dia": 0.5, "context": 0.4, "repeat": 0.6, "oracle": 0.7}  # the others do not apply
 
 
-def run_suite(scores: dict[str, float] = SCORES, *, epsilon: float = 10.0, without: Sequence[str] = ()) -> list[dict[str, Any]]:
-    """Return the records of the standard suite with these mean SSIM."""
+NEWEST = attack_suite.list_attack_suites()[-1]
+
+
+@pytest.fixture(autouse=True)
+def _one_version(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(attack_suite, "list_attack_suites", lambda: [STANDARD])
+
+
+def run_suite(
+    scores: dict[str, float] = SCORES, *, epsilon: float = 10.0, without: Sequence[str] = (), suite: str = STANDARD
+) -> list[dict[str, Any]]:
+    """Return the records of a suite with these mean SSIM."""
     records = []
-    for number, attack in enumerate(attack_suite.read_attacks([STANDARD])):
+    for number, attack in enumerate(attack_suite.read_attacks([suite])):
         name, encoded = attack.name(), spec.to_json(attack)
         if name in scores:
             values = (scores[name] + np.roll(DIFFERENCES, number)).tolist()
@@ -193,6 +203,15 @@ def test_table_shows_version_attack_baselines_and_flags(tmp_path: Path) -> None:
     assert row.values["flags"] == f"{WEAKER}: repeat:releases=2 than dia"
     assert STANDARD in to_markdown(table)
     assert "worst_case_low" in to_csv(table)
+
+
+def test_a_run_of_the_newest_version_has_the_older_one_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """So it can be compared with the rows of the older version."""
+    monkeypatch.setattr(attack_suite, "list_attack_suites", lambda: [STANDARD, NEWEST])
+    results = list_results(build_group(tmp_path / "new", run_suite(suite=NEWEST)))
+    assert [result.version for result in results] == [STANDARD, NEWEST]
+    (older,) = list_results(build_group(tmp_path / "old", run_suite()))
+    assert older.version == STANDARD
 
 
 def test_table_of_an_incomplete_run_lists_what_is_missing(tmp_path: Path) -> None:
