@@ -92,7 +92,7 @@ TRAININGS = (
     Training(
         file="positions-xfeat",
         defenses=("none",),
-        steps=1500,
+        steps=1000,
         rate=4e-3,
         initial=None,
         widths="24,32,48,48",
