@@ -19,9 +19,8 @@ from defenses.ldp import LDP
 from defenses.none import Undefended
 from metrics.ssim import SSIM
 
-OTHER_FEATURES = {ASSETS / f"inversion-{name}.safetensors" for name in ("oriented", "xfeat")}  # not compared here
 WORDS = ASSETS / "inversion-ldp.safetensors"  # trained longer than the others, with a context model
-NETWORKS = sorted(set(ASSETS.glob("inversion-*.safetensors")) - {*OTHER_FEATURES, WORDS})
+NETWORKS = [ASSETS / f"inversion-{name}.safetensors" for name in ("affine", "none")]  # compared with each other in tables
 
 THIRD = 266  # photographs that the dictionary was not built from
 
