@@ -330,6 +330,7 @@ class Extractor(Plugin, ABC):
     # Public properties of the descriptors, which attacks may use.
     exact_zeros: bool = False  # no component is negative, and many are exactly zero
     eight_bit: bool = False  # each descriptor is an 8-bit integer vector, scaled to unit norm
+    match_ratio: ClassVar[float] = 0.8  # of Lowe's test between raw descriptors; 1 leaves it out
     # Whether features are found by the photograph's name, so that its content does not determine them.
     reads_stored: ClassVar[bool] = False
 

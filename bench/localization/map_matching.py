@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from bench.api import Defense
+from bench.api import Defense, Extractor
 from bench.core.device import pick_device
 from bench.geometry.distances import find_mutual_nearest, points_to_points, subspaces_to_points, subspaces_to_subspaces
 from bench.localization.maps import Map
@@ -21,8 +21,6 @@ from bench.types import Descriptors, Indices, Release, Subspaces, WordSets
 
 if TYPE_CHECKING:
     from torch import Tensor
-
-RATIO = 0.8  # of Lowe's test
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -95,7 +93,7 @@ class MutualNN(Matcher):
 
     release_types: ClassVar[tuple[type[Release], ...]] = (Descriptors, WordSets)
 
-    ratio: float = RATIO
+    ratio: float = Extractor.match_ratio
 
     def match(self, release: Release, retrieved: RetrievedReferences) -> Correspondences:
         import torch
@@ -175,6 +173,12 @@ def explain_not_applicable(name: str, defense: Defense) -> str | None:
     if matcher.needs_noise and not defense.noisy:
         return f"{name} matches descriptors under strong noise; {defense.name()} adds none"
     return None
+
+
+def build_matcher(name: str, ratio: float) -> Matcher:
+    """Return a matcher. `ratio` is that of Lowe's test between raw descriptors of the extractor."""
+    matcher = MATCHERS[name]
+    return matcher(ratio=ratio) if matcher is MutualNN else matcher()
 
 
 def select_matcher(defense: Defense) -> str | None:

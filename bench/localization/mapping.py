@@ -26,21 +26,20 @@ from bench.types import Features, Indices
 if TYPE_CHECKING:
     import pycolmap
 
-RATIO = 0.8  # of the ratio test among references
 EPIPOLAR = 4.0  # pixels
 
 Matches = dict[tuple[int, int], Indices]  # references a < b -> (M, 2) keypoints of a, of b
 
 
-def build_map(references: Sequence[Reference], features: Sequence[Features]) -> Map:
-    """Return the map of references, built from their features.
+def build_map(references: Sequence[Reference], features: Sequence[Features], ratio: float) -> Map:
+    """Return the map of references, built from their features. `ratio` is that of Lowe's test of matches.
 
     Raises
     ------
     UserError
         if no point could be triangulated.
     """
-    matches = verify_matches(references, features, _match_pairs(features, covisibility.select_pairs(references)))
+    matches = verify_matches(references, features, _match_pairs(features, covisibility.select_pairs(references), ratio))
     points, xyz = triangulate(references, features, matches)
     if len(xyz) == 0:
         raise UserError("the map has no point: do the references overlap?")
@@ -91,7 +90,9 @@ def triangulate(references: Sequence[Reference], features: Sequence[Features], m
     return np.concatenate(points).astype(np.int64), np.array([model.points3D[point].xyz for point in ids]).reshape(-1, 3)
 
 
-def _match_pairs(features: Sequence[Features], pairs: Sequence[tuple[int, int]]) -> Iterable[tuple[tuple[int, int], Indices]]:
+def _match_pairs(
+    features: Sequence[Features], pairs: Sequence[tuple[int, int]], ratio: float
+) -> Iterable[tuple[tuple[int, int], Indices]]:
     """Yield the mutually nearest descriptors of each pair of references."""
     import torch
 
@@ -99,7 +100,7 @@ def _match_pairs(features: Sequence[Features], pairs: Sequence[tuple[int, int]])
     rows = [torch.from_numpy(each.descriptors).to(device) for each in features]
     with Progress("map: matches", len(pairs)) as progress:
         for a, b in pairs:
-            yield (a, b), np.stack(find_mutual_nearest(points_to_points(rows[a], rows[b]), RATIO), axis=1)
+            yield (a, b), np.stack(find_mutual_nearest(points_to_points(rows[a], rows[b]), ratio), axis=1)
             progress.advance()
 
 

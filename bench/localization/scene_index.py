@@ -55,9 +55,11 @@ class SceneIndex:
         """
         source = provenance.hash_modules(mapping.__name__, covisibility.__name__)
         images = samples.hash_scene_images(self.scene.references)
-        key = [self.digest, images, source, environment.list_extractor_library_versions()]
-        references = self.scene.references
-        arrays, meta = store.fetch(maps.KIND, key, lambda: mapping.build_map(references, self.reference_features).to_arrays())
+        references, ratio = self.scene.references, self.extractor.match_ratio
+        key = [self.digest, images, source, environment.list_extractor_library_versions(), ratio]
+        arrays, meta = store.fetch(
+            maps.KIND, key, lambda: mapping.build_map(references, self.reference_features, ratio).to_arrays()
+        )
         return maps.from_arrays(arrays, meta)
 
     def quantize_map(self, words: Dictionary) -> Indices:

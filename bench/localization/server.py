@@ -80,7 +80,7 @@ class Server:
         matcher : one of map_matching.MATCHERS that applies to the release
         trials : largest number of RANSAC trials
         """
-        method = map_matching.MATCHERS[matcher]()
+        method = map_matching.build_matcher(matcher, self.scene_index.extractor.match_ratio)
         dictionary = self.find_dictionary(defense) if method.needs_words and defense is not None else None
         retrieved = RetrievedReferences(
             map=self.scene_index.map,

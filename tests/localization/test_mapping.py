@@ -45,7 +45,7 @@ def queries(stretch: Views) -> Views:
 
 @pytest.fixture(scope="module")
 def scene_map(references: Views) -> Map:
-    return mapping.build_map(*references)
+    return mapping.build_map(*references, 0.8)
 
 
 @pytest.mark.slow
@@ -78,7 +78,7 @@ def test_map_has_the_keypoints_of_all_references_in_order(scene_map: Map, refere
 
 
 def test_same_references_give_the_same_map(scene_map: Map, references: Views) -> None:
-    again = mapping.build_map(*references)
+    again = mapping.build_map(*references, 0.8)
     np.testing.assert_array_equal(again.points, scene_map.points)
     np.testing.assert_array_equal(again.xyz, scene_map.xyz)
 
@@ -94,7 +94,7 @@ def test_matches_against_the_poses_are_dropped(references: Views) -> None:
 def test_references_without_overlap_give_no_map(references: Views) -> None:
     noise = [draw_features(100, seed=number) for number in range(len(references[0]))]
     with pytest.raises(UserError, match="the map has no point: do the references overlap"):
-        mapping.build_map(references[0], noise)
+        mapping.build_map(references[0], noise, 0.8)
 
 
 def test_neighbours_are_the_nearest_that_look_the_same_way(references: Views) -> None:
