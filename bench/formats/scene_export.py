@@ -41,7 +41,7 @@ def write(scene: Scene, layout: str, out: Path) -> None:
         raise UserError(f"--layout {layout}: unknown layout; available: {', '.join(LAYOUTS)}")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise UserError(f"--out {out}: exists already; give a new folder")
-    references, queries = (tuple(map(_rename, images)) for images in (scene.references, scene.queries))
+    references, queries = tuple(map(_rename, scene.references)), tuple(map(_rename, scene.queries))
     scene, images_to_write = dataclasses.replace(scene, references=references, queries=queries), references + queries
     _check_names([image.name for image in images_to_write], out)
     images = LAYOUTS[layout](scene, out)

@@ -114,7 +114,7 @@ def test_a_reader_accepts_other_names(name: str, windows: bool) -> None:
 
 def test_pictures_of_a_hostile_record_stay_in_the_folder(tmp_path: Path) -> None:
     far = "../" * 9
-    record = {"experiment_id": f"{far}e", "sample": f"{far}x", "dataset": {"hash": f"sha256:{far}h"}}
+    record = {"experiment_id": f"{far}e", "sample": f"{far * 2}x", "dataset": {"hash": f"sha256:{far}h"}}
     for path in (
         directory.reconstruction_path(tmp_path, record),
         directory.photograph_path(tmp_path, record),

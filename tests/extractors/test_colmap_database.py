@@ -151,7 +151,7 @@ def test_damaged_tables_are_explained(root: Path, tmp_path: Path, codes: np.ndar
         extract(path, root)
 
 
-def test_views_without_an_end_are_interrupted(root: Path, tmp_path: Path, codes: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_endless_views_are_interrupted(root: Path, tmp_path: Path, codes: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("bench.extractors.colmap_database.MAX_CHECKS", 10)
     path = write(tmp_path / "a.db", codes)
     # A million rows: more than the limit allows, and few enough that a missing limit fails this test and does not block it.
