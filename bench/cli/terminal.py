@@ -101,6 +101,11 @@ def parse_size(text: str) -> int:
         raise argparse.ArgumentTypeError(f"expected a size such as 20MB, not {text!r}") from None
 
 
+def format_count(count: int, noun: str) -> str:
+    """Format a number of things: `1 record`, `2 records`."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
 def format_size(count: int) -> str:
     """Format a number of bytes."""
     power = min(3, max(0, (len(str(count)) - 1) // 3))

@@ -1,13 +1,15 @@
 """Export of a scene to the layouts that `bench.datasets.aachen` and `bench.datasets.colmap` read.
 
-Images are written as PNG, so no pixel changes. Foreground masks and ground truth are written, too, if they are known.
+Images are written as PNG, so no pixel changes, and `.png` is appended to other names. Foreground masks and ground truth are
+written, too, if they are known.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Mapping
-from pathlib import Path
-from typing import TYPE_CHECKING, get_args
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, TypeVar, get_args
 
 import numpy as np
 from PIL import Image
@@ -16,10 +18,14 @@ from bench.core import paths
 from bench.core.errors import UserError
 from bench.core.progress import Progress
 from bench.formats import lists, nvm
-from bench.images.scene import Condition, Reference, Scene
+from bench.images.scene import Condition, Reference, Scene, SceneImage
 
 if TYPE_CHECKING:
     import pycolmap
+
+SUFFIX = ".png"
+
+S = TypeVar("S", bound=SceneImage)
 
 
 def write(scene: Scene, layout: str, out: Path) -> None:
@@ -28,16 +34,16 @@ def write(scene: Scene, layout: str, out: Path) -> None:
     Raises
     ------
     UserError
-        if the folder is not empty, a name leads out of it, the layout is unknown, or the layout cannot represent the scene.
+        if the folder is not empty, the layout is unknown, or the layout cannot represent the scene. Names of images must not lead
+        out of the folder, nor need the path of another one.
     """
     if layout not in LAYOUTS:
         raise UserError(f"--layout {layout}: unknown layout; available: {', '.join(LAYOUTS)}")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise UserError(f"--out {out}: exists already; give a new folder")
-    images_to_write = scene.references + scene.queries
-    lists.check_names(image.name for image in images_to_write)
-    for image in images_to_write:
-        paths.find_file(out, image.name)  # refuses a name that leads out of the folder, before anything is written
+    references, queries = tuple(map(_rename, scene.references)), tuple(map(_rename, scene.queries))
+    scene, images_to_write = dataclasses.replace(scene, references=references, queries=queries), references + queries
+    _check_names([image.name for image in images_to_write], out)
     images = LAYOUTS[layout](scene, out)
     poses = {query.name: query.cam_from_world for query in scene.queries if query.cam_from_world is not None}
     if poses:
@@ -49,6 +55,24 @@ def write(scene: Scene, layout: str, out: Path) -> None:
             if mask is not None:
                 _save_png(paths.find_file(out / "foreground", image.name), mask.astype(np.uint8) * 255)
             progress.advance(note=image.name)
+
+
+def _rename(image: S) -> S:
+    """Return an image with the name of its file."""
+    return image if image.name.endswith(SUFFIX) else dataclasses.replace(image, name=image.name + SUFFIX)
+
+
+def _check_names(names: list[str], out: Path) -> None:
+    """Raise UserError, before anything is written, for a name that a list or the folder cannot hold beside the others."""
+    lists.check_names(names)
+    seen: set[str] = set()
+    folders = {str(folder) for name in names for folder in PurePosixPath(name).parents}
+    for name in names:
+        paths.find_file(out, name)
+        path = str(PurePosixPath(name))
+        if path in seen or path in folders:
+            raise UserError(f"{name}: two images would need this path; rename one of them")
+        seen.add(path)
 
 
 def _write_aachen(scene: Scene, out: Path) -> Path:
@@ -119,7 +143,7 @@ def _group_by_condition(scene: Scene) -> dict[Condition, dict[str, pycolmap.Came
 
 def _save_png(path: Path, pixels: np.ndarray) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(pixels).save(path.with_suffix(".png"), compress_level=4)
+    Image.fromarray(pixels).save(path, compress_level=4)
 
 
 LAYOUTS: Mapping[str, Callable[[Scene, Path], Path]] = {"aachen": _write_aachen, "colmap": _write_colmap}

@@ -177,7 +177,8 @@ def dry_run(plan: Plan) -> None:
         if no pair applies, a defense refuses its configuration, or a database is of other features.
     """
     if all(experiment.reason for experiment in plan.experiments):
-        raise UserError("nothing to run: " + "; ".join(sorted({str(experiment.reason) for experiment in plan.experiments})))
+        reasons = "; ".join(sorted({str(experiment.reason) for experiment in plan.experiments}))
+        raise UserError(f"nothing to run: {reasons}; `bench list attacks` shows the attacks that apply to each defense")
     runner = TrialRunner(plan)
     for sample in plan.samples:
         try:

@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from fakes import build_exif, draw_texture
+from PIL import ExifTags, Image
 from safetensors.numpy import save_file
 
 from bench.cli import main
@@ -107,6 +109,25 @@ def test_from_the_command_line(album, tmp_path, capsys):
     assert main(["dictionary", "build", "--images", str(album), "--size", "32", "--out", str(out)]) == 2
     assert "exists already" in capsys.readouterr().err.splitlines()[-1]
     assert len(dictionary.load(out)) == 64
+
+
+def test_odd_numbers_in_exif_leave_no_photograph_out(tmp_path, capsys):
+    """The words are those of the upright picture, although the file states a resolution of -1 / 0."""
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 6
+    words = []
+    for name, options in (("whole", {"exif": exif}), ("odd", {"exif": build_exif(6, -1, 0)}), ("turned", {})):
+        (tmp_path / name).mkdir()
+        draw_texture(0, (80, 64)).save(tmp_path / name / "a.png", **options)
+        draw_texture(1, (80, 64)).save(tmp_path / name / "b.png")
+        arguments = ["--images", str(tmp_path / name), "--size", "20", "--out", str(tmp_path / f"{name}.safetensors")]
+        assert main(["dictionary", "build", *arguments]) == 0
+        shown = capsys.readouterr()
+        assert "of 2 photographs" in shown.out
+        assert "skipped" not in shown.err
+        words.append(dictionary.load(tmp_path / f"{name}.safetensors").words)
+    assert np.array_equal(words[0], words[1])
+    assert not np.array_equal(words[1], words[2])  # the negative control: without the rotation the words are others
 
 
 def test_flipped_bit_is_detected(dictionary_file, tmp_path):

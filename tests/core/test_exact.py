@@ -56,11 +56,12 @@ def test_exponents_at_the_limits_of_doubles() -> None:
     assert to_fraction("1e308") == 10**308
     assert to_fraction("5e-324") == Fraction(5, 10**324)
     assert Exact("0." + "0" * 4000 + "1E4000") == 0.1
-    assert Exact("0E400000000").fraction == 0
+    assert Exact("0E400000").fraction == 0
 
 
-# Written out, the first three have 400 million digits, which takes hours.
-HUGE = ["1E400000000", "-1E400000000", "1E-400000000", "1E99999999999999999999", "1" * 5000, "1e-400"]
+# Written out, the first three have a thousand times fewer digits than those that take hours, so that a missing bound fails the
+# tests and does not block them.
+HUGE = ["1E400000", "-1E400000", "1E-400000", "1E99999999999999999999", "1" * 5000, "1e-400"]
 
 
 @pytest.mark.parametrize("text", [*HUGE, "", "nan", "much", "1/0", "1e400", "1/2/3", "1E400000000/3", "sNaN"])

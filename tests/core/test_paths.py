@@ -113,10 +113,11 @@ def test_a_reader_accepts_other_names(name: str, windows: bool) -> None:
 
 
 def test_pictures_of_a_hostile_record_stay_in_the_folder(tmp_path: Path) -> None:
-    record = {"experiment_id": "../../e", "sample": "../../../x", "dataset": {"hash": "sha256:../../h"}}
+    far = "../" * 9
+    record = {"experiment_id": f"{far}e", "sample": f"{far * 2}x", "dataset": {"hash": f"sha256:{far}h"}}
     for path in (
         directory.reconstruction_path(tmp_path, record),
         directory.photograph_path(tmp_path, record),
-        directory.figure_path(tmp_path, "../../../x"),
+        directory.figure_path(tmp_path, f"{far}x"),
     ):
         assert path.resolve().is_relative_to(tmp_path.resolve())

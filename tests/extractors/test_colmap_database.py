@@ -151,10 +151,11 @@ def test_damaged_tables_are_explained(root: Path, tmp_path: Path, codes: np.ndar
         extract(path, root)
 
 
-def test_endless_views_end(root: Path, tmp_path: Path, codes: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_endless_views_are_interrupted(root: Path, tmp_path: Path, codes: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("bench.extractors.colmap_database.MAX_CHECKS", 10)
     path = write(tmp_path / "a.db", codes)
-    numbers = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n)"
+    # A million rows: more than the limit allows, and few enough that a missing limit fails this test and does not block it.
+    numbers = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n WHERE i < 1000000)"
     endless = f"{numbers} SELECT 1 AS image_id, i AS rows, i AS cols, i AS data FROM n WHERE i < 0"
     execute(path, "DROP TABLE keypoints", f"CREATE VIEW keypoints AS {endless}")
     with pytest.raises(SampleError, match="interrupted"):

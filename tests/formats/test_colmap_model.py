@@ -211,8 +211,9 @@ def test_damaged_binary_files_are_refused(
         colmap_model.read(binary)
 
 
-def test_vast_counts_of_points_cost_nothing(binary: Path) -> None:
+def test_vast_counts_of_points_cost_nothing(binary: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """pycolmap allocates and reads as many points as the file announces, which takes minutes."""
+    monkeypatch.setattr(pycolmap, "Reconstruction", None)  # a call of it fails this test, and does not block it
     expected = colmap_model.read(binary)
     (binary / "points3D.bin").write_bytes(struct.pack("<Q", 2**62) + b"\0" * 1000)
     assert colmap_model.read(binary).keys() == expected.keys()

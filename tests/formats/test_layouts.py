@@ -396,3 +396,36 @@ def test_no_image_is_written_outside_the_folder(original: Scene, tmp_path: Path,
     with pytest.raises(UserError, match="expected a name of a file below"):
         scene_export.write(dataclasses.replace(original, queries=queries), layout, tmp_path / "deep" / "out")
     assert list(tmp_path.iterdir()) == []
+
+
+def rename(scene: Scene, *names: str) -> Scene:
+    """Return the scene with other names of its first references."""
+    renamed = (dataclasses.replace(image, name=name) for image, name in zip(scene.references, names, strict=False))
+    return dataclasses.replace(scene, references=(*renamed, *scene.references[len(names) :]))
+
+
+@pytest.mark.parametrize("layout", LOADERS)
+def test_images_of_other_formats_are_found_under_the_names_of_their_files(original: Scene, tmp_path: Path, layout: str) -> None:
+    """Otherwise a list would name `a.jpg`, which is written as a PNG file, and `a.jpg` would take the file of `a.png`."""
+    scene_export.write(rename(original, "db/a.jpg", "db/a.png", "db/b c.JPG"), layout, tmp_path / "out")
+    found = LOADERS[layout](tmp_path / "out").references
+    assert [image.name for image in found] == ["db/a.jpg.png", "db/a.png", "db/b c.JPG.png"]
+    for one, other in zip(original.references, found, strict=True):
+        assert np.array_equal(one.pixels.read(), other.pixels.read())
+
+
+@pytest.mark.parametrize(
+    ("names", "complaint"),
+    [
+        (("db/" + "x" * 252,), "no name of a file is longer than 255 bytes"),
+        (("db/x.jpg", "db/x.jpg.png"), r"db/x\.jpg\.png: two images would need this path"),
+        (("db/x", "db/x.png/y.png"), r"db/x\.png: two images would need this path"),
+        (("db/x.png", "db//x.png"), r"db//x\.png: two images would need this path"),
+    ],
+)
+def test_images_that_would_need_one_path_are_refused(
+    original: Scene, tmp_path: Path, names: tuple[str, ...], complaint: str
+) -> None:
+    with pytest.raises(UserError, match=complaint):
+        scene_export.write(rename(original, *names), "colmap", tmp_path / "out")
+    assert not (tmp_path / "out").exists()

@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import struct
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -60,6 +61,13 @@ def write_album(folder: Path, count: int = 2, first: int = 0) -> Path:
     for number in range(first, first + count):
         draw_texture(number).save(folder / f"{number}.png")
     return folder
+
+
+def build_exif(orientation: int, *rational: int) -> bytes:
+    """Return EXIF data with an orientation and a signed rational number in place of the resolution."""
+    entries = struct.pack("<HHI", 0x112, 3, 1) + struct.pack("<HH", orientation, 0) + struct.pack("<HHII", 0x11A, 10, 1, 38)
+    head = b"Exif\0\0II*\0" + struct.pack("<I", 8) + struct.pack("<H", 2)
+    return head + entries + struct.pack("<I", 0) + struct.pack("<ii", *rational)
 
 
 def write_scene(folder: Path, references: int = 3, queries: int = 4) -> Scene:

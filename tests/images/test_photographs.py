@@ -2,14 +2,13 @@
 
 import logging
 import os
-import struct
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from fakes import draw_texture, write_album
+from fakes import build_exif, draw_texture, write_album
 from PIL import Image, ImageOps, features
 
 from bench.core.errors import SampleError, UserError
@@ -192,13 +191,6 @@ def test_orientations_agree_with_pillow(tmp_path: Path, orientation: int, suffix
             read_upright_size(Source(path.name, path), (80, 64))
     else:
         assert read_upright_size(Source(path.name, path), (80, 64)) == (80, 64)
-
-
-def build_exif(orientation: int, *rational: int) -> bytes:
-    """EXIF data with an orientation and a signed rational number in place of the resolution."""
-    entries = struct.pack("<HHI", 0x112, 3, 1) + struct.pack("<HH", orientation, 0) + struct.pack("<HHII", 0x11A, 10, 1, 38)
-    head = b"Exif\0\0II*\0" + struct.pack("<I", 8) + struct.pack("<H", 2)
-    return head + entries + struct.pack("<I", 0) + struct.pack("<ii", *rational)
 
 
 @pytest.mark.parametrize("rational", [(-1, 0), (0, 0), (1, -1), (-(2**31), -1)])

@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import json
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -203,9 +204,15 @@ def test_command(honest: Lines, folder: Path, tmp_path: Path, capfd: pytest.Capt
     output, messages = capfd.readouterr()
     assert all(line.startswith("line 1: ") for line in output.splitlines())
     assert "\x1b" not in output
-    assert "faults in 1 records" in messages
+    assert re.search(r"bench: \d+ faults in 1 record$", messages, re.MULTILINE)
     path.write_text("".join(json.dumps(records.seal(record)) + "\n" for record in honest))
     assert cli.main(["submit-check", str(path), *beside]) == 0
+    assert "bench: no fault in 3 records, of which" in capfd.readouterr().err
+    changed = [records.seal(honest[0]), *honest[1:]]
+    changed[2] = changed[2] | {"reason": "no"}  # without its digest
+    path.write_text("".join(json.dumps(record) + "\n" for record in changed))
+    assert cli.main(["submit-check", str(path), *beside]) == 1
+    assert "bench: 1 fault in 3 records\n" in capfd.readouterr().err
     assert cli.main(["submit-check", str(tmp_path / "absent")]) == 2
     assert cli.main(["submit-check", str(path), "--file", str(path)]) == 2
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from bench.cli.terminal import DONE, FAILED, add_images, add_seed, parse_whole, print_status
+from bench.cli.terminal import DONE, FAILED, add_images, add_seed, format_count, parse_whole, print_status
 
 SUMMARY = "check submitted records: schema, hashes, ranges, applicability and duplicates; recompute a sample of them"
 EPILOG = """The attack of a recomputed record runs in a process that never holds the secret. Its plugins must be installed.
@@ -46,6 +46,7 @@ def execute(args: argparse.Namespace) -> int:
     )
     for line in submission.format_faults(faults):
         print(line)
+    checked = format_count(count, "record")
     if faults:
-        return print_status(FAILED, f"{len(faults)} faults in {count} records")
-    return print_status(DONE, f"no fault in {count} records, of which at most {min(args.sample, count)} were recomputed")
+        return print_status(FAILED, f"{format_count(len(faults), 'fault')} in {checked}")
+    return print_status(DONE, f"no fault in {checked}, of which at most {min(args.sample, count)} were recomputed")
