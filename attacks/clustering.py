@@ -76,7 +76,7 @@ class Clustering(DescriptorAttack):
         nearest, distances = find_nearest_to_subspaces(release, z, self.neighbours)
         candidates = build_candidates(release, z, nearest, distances, clusters)  # (N, k, D)
         shared = find_shared_sub_database(release, view.know(OtherReleases).draw(self.others), words, self.coverage)
-        view.notes.append(shared.summary())
+        view.notes.extend(shared.list_notes(self.coverage))
         return select_candidates(candidates, shared)
 
 

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.api import Selection, SelectiveAttack, View
+from bench.api import NOT_CONVERGED, Selection, SelectiveAttack, View
 from bench.core.errors import SampleError
 from bench.localization import map_matching
 from bench.threat_model import ServerMap
@@ -55,6 +55,8 @@ class Inlier(SelectiveAttack):
         descriptors = server.scene_index.map.descriptors[matches.rows[verified]]
         rows, first = np.unique(keypoints, return_index=True)
         view.notes.append(f"{len(rows)} keypoints verified")
+        if pose is not None and pose.trials >= self.trials:
+            view.notes.append(f"{NOT_CONVERGED}: RANSAC made all {self.trials} trials")
         return Selection(rows=rows, descriptors=descriptors[first])
 
 

@@ -62,7 +62,8 @@ class Intersection(DescriptorAttack):
         release, adversarial = require_subspaces(view)
         shared = find_shared_sub_database(release, view.know(OtherReleases).draw(self.others), adversarial, self.coverage)
         words = reconstruct_database(find_intersections_within(shared.subspaces))
-        view.notes.append(f"{shared.summary()}; {len(words)} words reconstructed")
+        summary, *others = shared.list_notes(self.coverage)
+        view.notes.extend([f"{summary}; {len(words)} words reconstructed", *others])
         return estimate_descriptors(release, words, adversarial, self.neighbours, self.estimators)
 
 

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.api import Defense, Extractor, PositionAttack, View
+from bench.api import NOT_CONVERGED, Defense, Extractor, PositionAttack, View
 from bench.codebook.public import Public
 from bench.core.errors import SampleError
 from bench.geometry.lines import read_lines
@@ -65,6 +65,8 @@ class Snap(PositionAttack):
             known[pairs.keypoints[inliers]] = server.camera.img_from_cam(in_camera)
         verified = ~np.isnan(known[:, 0])
         view.notes.append(f"{verified.sum()} keypoints verified")
+        if result.estimate is not None and result.estimate.trials >= self.trials:
+            view.notes.append(f"{NOT_CONVERGED}: RANSAC made all {self.trials} trials")
         near, weights = predict_neighbours(release, view.defense, view.know(PublicAssets).assets, self.neighbours)
         positions = recover_positions(read_lines(release), near, weights, release.size, self.reach, known)
         return np.where(verified[:, None], known, positions).astype(np.float32)

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 K = TypeVar("K", bound=Knowledge)
 
+NOT_CONVERGED = "not converged"  # start of a note in `View.notes`: the attack reached its budget first
+
 
 class Plugin:
     """Base class of all plugins."""

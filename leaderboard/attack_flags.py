@@ -1,6 +1,7 @@
 """Flags for attacks that failed: their scores say little about the defense.
 
 - **At baseline**: the attack has no signal (`leaderboard.signal`).
+- **Not converged**: a note of the attack says that it reached its budget first (`bench.api.NOT_CONVERGED`).
 - **Weaker with more knowledge**: an attack scores significantly lower than one that knows less. An attacker who knows more could
   run the other attack. One attack knows less than another if its `needs` are a part of the other's, or if they are equal and it
   observes less. `PublicAssets` does not count, as everybody has public photographs. `blank` observes less than `keypoints`, and
@@ -8,7 +9,7 @@
 - **Not monotone in ε**: an attack scores significantly lower at a larger ε of the same defense, where the release says more.
 
 The last two compare the values of `METRICS` by Student's t on differences that are paired by sample, one-sided, with Holm's
-correction over all comparisons of the flag in a comparison group. No attack reports whether it converged, so no flag says so.
+correction over all comparisons of the flag in a comparison group.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from dataclasses import dataclass
 from itertools import permutations
 from typing import Any
 
-from bench.api import Attack
+from bench.api import NOT_CONVERGED, Attack
 from bench.core.errors import UserError
 from bench.core.hashing import canonical_json
 from bench.registry import discovery
@@ -67,9 +68,19 @@ def flag_attacks(group: ComparisonGroup, results: Sequence[SuiteResult]) -> list
             if (signal := group.signals.get(one)) and signal.is_absent
             for metric in METRICS
         ),
+        *_flag_not_converged(values),
         *_flag_weaker(results, values),
         *_flag_not_monotone(results, values),
     ]
+
+
+def _flag_not_converged(experiments: Iterable[GroupedExperiment]) -> Iterator[Flag]:
+    for one in experiments:
+        count = sum(any(note.startswith(NOT_CONVERGED) for note in record["notes"]) for record in one.completed)
+        for metric in METRICS if count else ():
+            yield Flag(
+                experiment=one, metric=metric, text=f"{NOT_CONVERGED}: {one.attack} in {count} of {len(one.completed)} samples"
+            )
 
 
 def knows_less(one: type[Attack], other: type[Attack]) -> bool:

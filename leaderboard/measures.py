@@ -21,8 +21,8 @@ from leaderboard.tables import MEDIAN_METRICS, PAPER_METRICS
 
 PRIVACY = "ssim"  # the measure of plots, and the first of `RANKING`
 RANKING = (PRIVACY, IDENTIFIED)  # the measures that rank defenses
-# The utility is the first of these with values: the recall of localization, otherwise the accuracy of matching.
-UTILITY = ("recall_0.25m_2deg", "accuracy_3px")
+# The utility is the first of these with values: the recall of localization, otherwise that of matching (the matching score).
+UTILITY = ("recall_0.25m_2deg", "recall")
 
 PARTS = ("foreground", "background")  # parts of an image for which records have additional values of some metrics
 

@@ -65,7 +65,9 @@ def build_tradeoffs(attack_group: ComparisonGroup, groups: Sequence[ComparisonGr
     photographs, and matching only if localization is missing.
     """
     for utility in list_measures(UTILITY):
-        candidates = [one for one in groups if utility in one.measures and _shared_key(one) == _shared_key(attack_group)]
+        candidates = [
+            one for one in groups if utility in one.measures and list_shared_settings(one) == list_shared_settings(attack_group)
+        ]
         same = [one for one in candidates if one.metadata["dataset"]["hash"] == attack_group.metadata["dataset"]["hash"]]
         tradeoffs = [
             _build_tradeoff(attack_group, group, privacy, utility, condition)
@@ -137,15 +139,17 @@ def _find_same_defense(standing: Standing, experiments: Sequence[GroupedExperime
     content = standing.experiments[0].metadata["dataset"]["hash"]
     if equal or any(one.metadata["dataset"]["hash"] == content for one in experiments):
         return equal[0] if equal else None
-    alike = [one for one in experiments if _drop_files(one.metadata["defense"]) == _drop_files(standing.configuration)]
+    alike = [one for one in experiments if drop_files(one.metadata["defense"]) == drop_files(standing.configuration)]
     return alike[0] if len(alike) == 1 else None
 
 
-def _drop_files(configuration: Mapping[str, Any]) -> dict[str, Any]:
+def drop_files(configuration: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the configuration of a defense without the digests of its files."""
     if "parts" in configuration:
-        return {**configuration, "parts": [_drop_files(part) for part in configuration["parts"]]}
+        return {**configuration, "parts": [drop_files(part) for part in configuration["parts"]]}
     return {name: None if str(value).startswith("sha256:") else value for name, value in configuration.items()}
 
 
-def _shared_key(group: ComparisonGroup) -> str:
+def list_shared_settings(group: ComparisonGroup) -> str:
+    """Return extractor, seeds and source, which are equal in groups that can be joined."""
     return canonical_json([group.metadata["dataset"]["extractor"], group.seeds, group.metadata["environment"]["source"]])

@@ -121,17 +121,17 @@ def _find_worst_cases(group: ComparisonGroup, experiments: Sequence[GroupedExper
         attacks = {one: score for one, score in scores.items() if not is_oracle(one.metadata)}
         if not attacks:
             continue
-        worst = _find_worst(measure, attacks)
+        worst = find_worst(measure, attacks)
         references = {one: score for one, score in scores.items() if one not in attacks}
         yield WorstCase(
             measure=measure,
             score=attacks[worst],
             experiment=worst,
             baselines={name: score for name in BASELINES for one, score in attacks.items() if get_attack(one.metadata) == name},
-            oracle=references[_find_worst(measure, references)] if references else None,
+            oracle=references[find_worst(measure, references)] if references else None,
         )
 
 
-def _find_worst(measure: Measure, scores: Mapping[GroupedExperiment, Interval]) -> GroupedExperiment:
+def find_worst(measure: Measure, scores: Mapping[GroupedExperiment, Interval]) -> GroupedExperiment:
     """Return the experiment with the greatest leakage, the first of equals. It has the least value if larger is better."""
     return max(scores, key=lambda one: -measure.better * scores[one].mean)

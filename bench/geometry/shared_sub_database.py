@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from bench.api import NOT_CONVERGED
 from bench.geometry.intersections import (
     Doubles,
     SubspaceIntersections,
@@ -38,8 +39,10 @@ class SharedSubDatabase:
     sharing: int  # of these, the ones that share the sub-database
     coverage: float  # fraction of the words in the target's subspaces that another of these contains
 
-    def summary(self) -> str:
-        return f"coverage {self.coverage:.3f}: {self.sharing} of {self.searched} other releases share the sub-database"
+    def list_notes(self, enough: float) -> list[str]:
+        """Return a summary, and a note if the coverage is less than `enough`."""
+        summary = f"coverage {self.coverage:.3f}: {self.sharing} of {self.searched} other releases share the sub-database"
+        return [summary, *([f"{NOT_CONVERGED}: coverage below {enough:g}"] if self.coverage < enough else [])]
 
 
 def find_shared_sub_database(target: Subspaces, others: Iterator[Release], words: int, enough: float) -> SharedSubDatabase:

@@ -79,7 +79,7 @@ def _write_group(
     table = group_tables.build_pairs_table(group)
     tables: dict[str, Table] = {"pairs": table}
     tables |= {"ranking": group_tables.build_ranking_table(group)} if group.has_attacks else {}
-    suite = suite_table.build_suite_table(group)
+    suite = suite_table.build_suite_table(group, groups)
     tables |= {"worst-case": suite} if suite else {}
     views = []
     for row in table.rows:

@@ -136,7 +136,9 @@ def compare_knowledge(attack: Attack, secret: Features, defense: Affine | LDP) -
 WITH_KNOWLEDGE = [
     attack
     for attack in discovery.load_plugins(discovery.ATTACK)
-    if issubclass(attack, DescriptorAttack) and attack.needs & (RELEASES | {DefenseDatabase, PublicDatabase})
+    if issubclass(attack, DescriptorAttack)
+    and Subspaces in attack.accepts
+    and attack.needs & (RELEASES | {DefenseDatabase, PublicDatabase})
 ]
 
 

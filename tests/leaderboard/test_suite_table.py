@@ -141,6 +141,14 @@ def test_an_attack_at_the_baselines_is_flagged(tmp_path: Path) -> None:
     assert set(flags) == {"at baseline: context:estimate=word"}
 
 
+def test_an_attack_that_reached_its_budget_is_flagged(tmp_path: Path) -> None:
+    notes = {"0.png": ["not converged: coverage below 0.95"], "1.png": ["coverage 0.96", "it converged"]}
+    records = [
+        rebuild(one, notes=notes.get(one["sample"], [])) if one["attack"]["name"] == "repeat" else one for one in run_suite()
+    ]
+    assert set(list_flags(build_group(tmp_path, records))) == {"not converged: repeat:releases=2 in 1 of 6 samples"}
+
+
 def test_an_attack_with_more_knowledge_that_scores_lower_is_flagged(tmp_path: Path) -> None:
     flags = list_flags(build_group(tmp_path, run_suite({**SCORES, "repeat": 0.3})))
     assert flags == [f"{WEAKER}: repeat:releases=2 than dia"]  # once, by the strongest

@@ -123,9 +123,9 @@ def test_groups_that_cannot_be_compared_have_no_tradeoff(tmp_path: Path, other: 
 
 
 def test_matching_replaces_missing_localization(tmp_path: Path) -> None:
-    pair = record("a-b", {"accuracy_3px": 0.7, "precision": 0.9}, defense=NONE, task="matching", attack=None, dataset=GALLERY)
+    pair = record("a-b", {"recall": 0.7, "precision": 0.9}, defense=NONE, task="matching", attack=None, dataset=GALLERY)
     (one,) = build(tmp_path / "m", reconstructions(NONE, [0.8]), [pair])
-    assert one.utility.label == "accuracy (3 px)"
+    assert one.utility.label == "recall"
     (one,) = build(tmp_path / "l", reconstructions(NONE, [0.8]), [pair], localizations(NONE, [1], [None]))
     assert one.utility.label == "recall (0.25 m, 2°)"
 

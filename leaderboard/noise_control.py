@@ -1,0 +1,126 @@
+"""Matched-noise control: whether a defense leaks less than Gaussian noise on raw descriptors at the same utility.
+
+The control of a defense is the setting of the defense `noise` whose utility is nearest to its own, and at most `TOLERANCE`
+away. The utility is the recall of localization, or else the matching score: the recall of the task `matching`. Both are
+measured for both defenses in one comparison group of the same features. `tools/match_noise.py` finds such settings.
+
+The leakage of the noise is the greatest mean over its attacks, baselines included, oracles excluded. It is compared with the
+worst case of the defense, paired by sample, by Student's t in both directions, with Holm's correction over all comparisons of
+a group. A defense that is not shown to leak less is marked. The leakage of the noise is a lower bound: a stronger attack on
+the noise can turn "more" into "less", but not "less" into anything else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from leaderboard.comparison import ComparisonGroup, GroupedExperiment
+from leaderboard.intervals import MIN_SAMPLES, Estimate, Interval, correct_holm, estimate_mean
+from leaderboard.measures import UTILITY, Measure, list_measures
+from leaderboard.signal import METRICS, SIGNIFICANCE, collect_values, is_oracle
+from leaderboard.tradeoff import drop_files, list_shared_settings
+from leaderboard.worst_case import SuiteResult, WorstCase, find_worst
+
+CONTROL = "noise"  # the name of the defense
+TOLERANCE = 0.02  # greatest difference of the utilities
+LESS, MORE, NOT_LESS = "leaks less than noise", "leaks more than noise", "not shown to leak less than noise"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Control:
+    """Noise at the utility of a defense."""
+
+    label: str  # of the noise
+    utility: Measure
+    utilities: tuple[float, float]  # of the defense and of the noise
+    experiments: tuple[GroupedExperiment, ...]  # attacks on the noise, without oracles
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class NoiseComparison:
+    """The worst case of a defense and that of its control, by one measure."""
+
+    control: Control
+    score: Interval  # of the noise
+    experiment: GroupedExperiment  # the attack that reached it
+    verdict: str | None  # `LESS`, `MORE` or `NOT_LESS`; None for measures that are not compared, and with too few samples
+
+
+def compare_with_noise(
+    group: ComparisonGroup, groups: Sequence[ComparisonGroup], results: Iterable[SuiteResult]
+) -> dict[WorstCase, NoiseComparison]:
+    """Return the comparison of each worst case whose defense has a control in the group. `groups` hold the utilities."""
+    pairs = [
+        (worst, control, attack)
+        for result in results
+        if (control := find_control(group, groups, result))
+        for worst in result.worst_cases
+        if (attack := _find_strongest(group, control, worst.measure))
+    ]
+    differences = {worst: _estimate_difference(group, worst, attack) for worst, _, attack in pairs}
+    tested = {worst: estimate for worst, estimate in differences.items() if estimate}
+    below = correct_holm([estimate.p_below(0.0) for estimate in tested.values()])
+    above = correct_holm([estimate.p_above(0.0) for estimate in tested.values()])
+    verdicts = {
+        worst: LESS if less < SIGNIFICANCE else MORE if more < SIGNIFICANCE else NOT_LESS
+        for worst, less, more in zip(tested, below, above, strict=True)
+    }
+    compared = {}
+    for worst, control, attack in pairs:
+        score = group.average(attack, worst.measure)
+        assert score is not None  # `_find_strongest` selects among those with a score
+        compared[worst] = NoiseComparison(control=control, score=score, experiment=attack, verdict=verdicts.get(worst))
+    return compared
+
+
+def find_control(group: ComparisonGroup, groups: Sequence[ComparisonGroup], result: SuiteResult) -> Control | None:
+    """Return the control of a defense; None if no noise in the group has its utility, or the defense is noise itself."""
+    defense = next(one for each in result.experiments.values() for one in each).metadata["defense"]
+    noises: dict[str, list[GroupedExperiment]] = {}
+    for one in group.experiments:
+        if one.metadata["defense"]["name"] == CONTROL and one.reason is None and not is_oracle(one.metadata):
+            noises.setdefault(one.defense, []).append(one)
+    if defense["name"] == CONTROL:
+        return None
+    for utility in list_measures(UTILITY):
+        for served in groups:
+            if utility not in served.measures or list_shared_settings(served) != list_shared_settings(group):
+                continue
+            own = _average_utility(served, utility, defense)
+            others = {
+                label: score
+                for label, each in noises.items()
+                if (score := _average_utility(served, utility, each[0].metadata["defense"])) is not None
+            }
+            if own is None or not others:
+                continue
+            label = min(others, key=lambda label: abs(others[label] - own))
+            if abs(others[label] - own) <= TOLERANCE:
+                utilities = own, others[label]
+                return Control(label=label, utility=utility, utilities=utilities, experiments=tuple(noises[label]))
+    return None
+
+
+def _average_utility(group: ComparisonGroup, utility: Measure, defense: dict[str, object]) -> float | None:
+    """Return the mean utility of a defense that has completed all samples; files such as dictionaries may differ."""
+    alike = [one for one in group.experiments if drop_files(one.metadata["defense"]) == drop_files(defense)]
+    scores = [group.average(one, utility) for one in alike if one.reason is None and not group.count_missing(one)]
+    return scores[0].mean if len(scores) == 1 and scores[0] else None
+
+
+def _find_strongest(group: ComparisonGroup, control: Control, measure: Measure) -> GroupedExperiment | None:
+    scores = {one: score for one in control.experiments if (score := group.average(one, measure))}
+    return find_worst(measure, scores) if scores else None
+
+
+def _estimate_difference(group: ComparisonGroup, worst: WorstCase, noise: GroupedExperiment) -> Estimate | None:
+    """Return the leakage of the defense minus that of the noise, by sample; None if it is not compared."""
+    if worst.measure.name not in METRICS:
+        return None
+    own, other = (
+        collect_values([record for sample in group.complete_samples(one) for record in sample])[worst.measure.metric]
+        for one in (worst.experiment, noise)
+    )
+    differences = [value - other[sample] for sample, value in own.items() if sample in other]
+    return estimate_mean(differences) if len(differences) >= MIN_SAMPLES else None
