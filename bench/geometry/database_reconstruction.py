@@ -35,11 +35,11 @@ def find_normalized_points(points: Doubles, tolerances: Doubles) -> Floats:
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import KDTree
 
-    unit = np.abs(np.linalg.norm(points, axis=1) - 1) < np.maximum(UNIT_TOLERANCE, tolerances)
-    words = points[unit]
+    normal = np.abs(np.linalg.norm(points, axis=1) - 1) < np.maximum(UNIT_TOLERANCE, tolerances)
+    words = points[normal]
     if len(words) == 0:
         return np.empty((0, points.shape[1]), dtype=np.float32)
-    pairs = KDTree(words).query_pairs(max(UNIT_TOLERANCE, float(np.median(tolerances[unit]))), output_type="ndarray")  # (M, 2)
+    pairs = KDTree(words).query_pairs(max(UNIT_TOLERANCE, float(np.median(tolerances[normal]))), output_type="ndarray")  # (M, 2)
     equal = coo_array((np.ones(len(pairs), bool), pairs.T), shape=(len(words), len(words)))
     return unit_rows(words[np.unique(connected_components(equal, directed=False)[1], return_index=True)[1]].astype(np.float32))
 
