@@ -16,28 +16,30 @@ Doubles = NDArray[np.float64]
 
 NORM = 512.0  # approximate norm of 8-bit descriptors
 INTEGER_TOLERANCE = 0.01  # a number this near to an integer counts as an integer; float32 releases err by 1e-4 of the last bit
-UNIT_TOLERANCE = 1e-4  # of the norm of a word, and of the distance of two equal words
+UNIT_TOLERANCE = 1e-4  # of the norm of a word, and of the distance of two equal words; their errors may allow more
 
 
 def reconstruct_database(intersections: SubspaceIntersections) -> Bytes | Floats:
     """Return the distinct words at which subspaces intersect in one point: 8-bit vectors, if there are any. -> (K, D)"""
-    points = intersections.points[intersections.single]
+    intersections = intersections.take(intersections.single)
+    points = intersections.points
     # A word has many intersections, at slightly different points.
     first = np.unique(np.rint(points * NORM), axis=0, return_index=True)[1]
     whole = np.unique(find_byte_vectors(points[first]), axis=0)
-    return whole if len(whole) else find_normalized_points(points[first])
+    return whole if len(whole) else find_normalized_points(points[first], intersections.tolerances[first])
 
 
-def find_normalized_points(points: Doubles) -> Floats:
-    """Return the distinct points of unit norm. (P, D) -> (K, D) float32"""
+def find_normalized_points(points: Doubles, tolerances: Doubles) -> Floats:
+    """Return the distinct points of unit norm, up to their errors. (P, D), (P,) -> (K, D) float32"""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import KDTree
 
-    words = points[np.abs(np.linalg.norm(points, axis=1) - 1) < UNIT_TOLERANCE]
+    normal = np.abs(np.linalg.norm(points, axis=1) - 1) < np.maximum(UNIT_TOLERANCE, tolerances)
+    words = points[normal]
     if len(words) == 0:
         return np.empty((0, points.shape[1]), dtype=np.float32)
-    pairs = KDTree(words).query_pairs(UNIT_TOLERANCE, output_type="ndarray")  # (M, 2)
+    pairs = KDTree(words).query_pairs(max(UNIT_TOLERANCE, float(np.median(tolerances[normal]))), output_type="ndarray")  # (M, 2)
     equal = coo_array((np.ones(len(pairs), bool), pairs.T), shape=(len(words), len(words)))
     return unit_rows(words[np.unique(connected_components(equal, directed=False)[1], return_index=True)[1]].astype(np.float32))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bench.geometry.intersections import INTERSECTION_DISTANCE
+from bench.geometry.intersections import estimate_tolerances
 from bench.geometry.nearest_words import unit_rows
 from bench.geometry.subspaces import Doubles, project
 from bench.types import Floats, Indices, Subspaces, Words
@@ -32,11 +32,12 @@ def estimate(
     (N, D) unit rows
     """
     means = np.empty((len(release), words.shape[1]))
+    tolerances = estimate_tolerances(release)[:, None]
     step = max(1, BATCH_WORDS // found.shape[1])
     for start in range(0, len(release), step):
         batch = slice(start, start + step)
         rows = unit_rows(words[found[batch]])  # (n, adversarial + |V|, D)
-        inside = distances[batch, :adversarial] < INTERSECTION_DISTANCE  # (n, adversarial)
+        inside = distances[batch, :adversarial] < tolerances[batch]  # (n, adversarial)
         cosines = rows @ rows[:, :adversarial].transpose(0, 2, 1)  # (n, adversarial + |V|, adversarial)
         # A greater cosine means a smaller min_j |â_j − v|. The â themselves come last.
         closeness = np.where(inside[:, None], cosines, -np.inf).max(axis=2)

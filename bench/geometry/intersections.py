@@ -5,7 +5,8 @@ c1 leave the quadratic form S = [[I, B2 δ], [(B2 δ)ᵀ, |δ|²]] − Gᵀ G of
 
 All pairs are screened in float32 after a projection onto dim + dim' + 16 fixed directions. A projection increases no distance, so
 intersecting pairs still intersect. Other pairs stay apart in the 16 extra directions. The remaining pairs are decided in float64
-and in all dimensions. Float32 releases of one descriptor have a distance of about 1e-7, other pairs of a tenth or more.
+and in all dimensions. Two subspaces intersect if their distance is within the errors of their release (`estimate_errors`).
+Float32 releases of one descriptor have a distance of about 1e-7, other pairs of a tenth or more.
 
 Floor, for a pair of equal dimensions: 2 (dim + 1)² (2 dim + 16) operations of a matrix product, dim (dim + 1)² + (dim + 1)³ / 3
 multiply-adds of the elimination. The latter take most of the time; pairs are contiguous in memory, so each step is a long loop.
@@ -30,10 +31,12 @@ if TYPE_CHECKING:
 
 Doubles = NDArray[np.float64]
 
-INTERSECTION_DISTANCE = 1e-5  # below this distance two subspaces intersect
+INTERSECTION_DISTANCE = 1e-5  # below this distance two subspaces intersect, whatever the errors of their release
+LARGEST_TOLERANCE = 0.05  # errors are not assumed to be larger: pairs that do not intersect have .08 or more
 SPARE_DIRECTIONS = 16  # directions beyond those that two subspaces span
-NEAR = 4e-4  # greatest squared distance that passes the screening; its error is about 2e-5 for points of unit norm
+NEAR = 4e-4  # squared distance that passes the screening beside the errors; its error is about 2e-5 for points of unit norm
 SINGULAR = 1e-9  # squared sine below which two directions are equal; common ones have about 1e-13 in bases orthonormal to 1e-14
+NEARLY_ORTHONORMAL = 1e-6  # largest excess of B Bᵀ that one Newton step removes; float32 has 1e-7
 PIVOT = 1e-6  # least divisor, for pairs that share a direction
 BLOCK = 600_000  # numbers in the quadratic forms of a block of pairs, which then fit into the cache
 ROWS = 8  # subspaces of the first side in a block
@@ -48,13 +51,16 @@ class SubspaceIntersections:
     second: Indices  # (P,) rows of the second release
     points: Doubles  # (P, D) midpoints of the nearest points of the two
     single: NDArray[np.bool_]  # (P,) whether the intersection is a single point, not a line or more
+    tolerances: Doubles  # (P,) distance of the two that their errors allow
 
     def __len__(self) -> int:
         return len(self.first)
 
     def take(self, rows: NDArray[Any]) -> SubspaceIntersections:
         """Return the pairs selected by `rows`: indices, or a mask."""
-        return SubspaceIntersections(self.first[rows], self.second[rows], self.points[rows], self.single[rows])
+        return SubspaceIntersections(
+            self.first[rows], self.second[rows], self.points[rows], self.single[rows], self.tolerances[rows]
+        )
 
 
 def find_intersections(one: Subspaces, other: Subspaces) -> SubspaceIntersections:
@@ -81,16 +87,53 @@ def concatenate_intersections(parts: Sequence[SubspaceIntersections]) -> Subspac
         np.concatenate([part.second for part in parts]),
         np.concatenate([part.points for part in parts]),
         np.concatenate([part.single for part in parts]),
+        np.concatenate([part.tolerances for part in parts]),
     )
+
+
+def estimate_tolerances(release: Subspaces) -> Doubles:
+    """Return for each subspace the distance below which it contains a point of unit norm: that which its errors allow. -> (N,)"""
+    return _limit(_estimate_moves(release))
+
+
+def _estimate_moves(release: Subspaces) -> Doubles:
+    """Return how far errors may move the points of unit norm in each subspace. -> (N,)
+
+    A point o + Bᵀ c of unit norm has |c| ≤ |o| + 1. So it moves by at most e (2 |o| + 1), if e is the error of unit vectors and
+    the relative error of o.
+    """
+    return estimate_errors(release) * (2 * np.linalg.norm(release.origins.astype(np.float64), axis=1) + 1)
+
+
+def _limit(distances: Doubles) -> Doubles:
+    return distances.clip(INTERSECTION_DISTANCE, LARGEST_TOLERANCE)
+
+
+def estimate_errors(release: Subspaces) -> Doubles:
+    """Return an estimate of the error of unit vectors in the span of each basis B: |B Bᵀ − I| √(D / dim), spectral norm. -> (N,)
+
+    An error in a random direction shows in dim of the D components of B Bᵀ − I. The estimate for float16 is 8e-4, for float32
+    7e-8. The published code orthogonalises in float32. Nearly dependent vectors, at dim 16, give it up to 1e-2. A small basis may
+    be orthonormal by chance, so no estimate is below the median of the release.
+    """
+    bases = release.bases.astype(np.float64)
+    values = np.linalg.eigvalsh(bases @ bases.transpose(0, 2, 1) - np.eye(release.dim))  # (N, dim)
+    errors = np.abs(values).max(axis=1) * (bases.shape[2] / release.dim) ** 0.5
+    return np.maximum(errors, np.median(errors)) if len(errors) else errors
 
 
 def _screen_pairs(one: Subspaces, other: Subspaces, triangle: bool = False) -> Iterator[tuple[Indices, Indices]]:
     """Yield pairs that may intersect, block by block; `triangle` skips blocks where each pair has `first` > `second`."""
+    import torch
+
     length = one.origins.shape[1]
     if one.dim + other.dim >= length:
         raise UserError(f"subspaces of dimensions {one.dim} and {other.dim} always intersect in a space of {length}")
+    moves = [np.square(_estimate_moves(release)) for release in (one, other)]
     for top, left, squares in squared_distances(one, other, one.dim + other.dim + SPARE_DIRECTIONS, triangle):
-        first, second = (squares < NEAR).nonzero(as_tuple=True)
+        rows, columns = (slice(start, start + count) for start, count in zip((top, left), squares.shape, strict=True))
+        allowed = (NEAR + moves[0][rows, None] + moves[1][columns]).clip(max=NEAR + LARGEST_TOLERANCE**2)  # (n, n')
+        first, second = (squares < torch.from_numpy(allowed).to(squares)).nonzero(as_tuple=True)
         yield first.cpu().numpy() + top, second.cpu().numpy() + left
 
 
@@ -155,16 +198,26 @@ def _decide_pairs(one: Subspaces, other: Subspaces, screened: Iterator[tuple[Ind
     """Return the screened pairs that intersect, decided in float64."""
     pairs = [np.empty((2, 0), dtype=np.int64), *(np.stack(pair) for pair in screened)]
     firsts, seconds = np.concatenate(pairs, axis=1)
-    parts = [SubspaceIntersections(firsts[:0], seconds[:0], np.empty((0, one.origins.shape[1])), np.empty(0, dtype=bool))]
+    none = np.empty(0)
+    parts = [SubspaceIntersections(firsts[:0], seconds[:0], np.empty((0, one.origins.shape[1])), none.astype(bool), none)]
+    errors, moves = ([measure(release) for release in (one, other)] for measure in (estimate_errors, _estimate_moves))
     for start in range(0, len(firsts), EXACT):
         first, second = firsts[start : start + EXACT], seconds[start : start + EXACT]
-        points, distances, single = find_nearest_points(one.take(first), other.take(second))
-        parts.append(SubspaceIntersections(first, second, points, single).take(distances < INTERSECTION_DISTANCE))
+        sines = np.hypot(errors[0][first], errors[1][second])
+        points, distances, single = find_nearest_points(one.take(first), other.take(second), sines)
+        tolerances = _limit(np.hypot(moves[0][first], moves[1][second]))
+        parts.append(SubspaceIntersections(first, second, points, single, tolerances).take(distances < tolerances))
     return concatenate_intersections(parts)
 
 
-def find_nearest_points(one: Subspaces, other: Subspaces) -> tuple[Doubles, Doubles, NDArray[np.bool_]]:
+def find_nearest_points(
+    one: Subspaces, other: Subspaces, sines: Doubles | float = 0.0
+) -> tuple[Doubles, Doubles, NDArray[np.bool_]]:
     """Return the nearest points of the two subspaces of each row, in float64.
+
+    Parameters
+    ----------
+    sines : (N,) directions of the two are equal if the sine of their angle is lower
 
     Returns
     -------
@@ -175,13 +228,17 @@ def find_nearest_points(one: Subspaces, other: Subspaces) -> tuple[Doubles, Doub
     G = A @ B.transpose(0, 2, 1)  # (N, dim, dim')
     slope = B @ apart - G.transpose(0, 2, 1) @ (A @ apart)  # (N, dim', 1)
     values, vectors = np.linalg.eigh(np.eye(B.shape[1]) - G.transpose(0, 2, 1) @ G)  # (N, dim'), (N, dim', dim')
-    inverse = np.where(values > SINGULAR, 1 / np.where(values > SINGULAR, values, 1), 0)[..., None]
+    differ = values > np.maximum(SINGULAR, np.square(sines))[..., None]  # (N, dim')
+    inverse = np.where(differ, 1 / np.where(differ, values, 1), 0)[..., None]
     coordinates = -vectors @ (inverse * (vectors.transpose(0, 2, 1) @ slope))  # (N, dim', 1) of the nearest point of `other`
     away = apart + B.transpose(0, 2, 1) @ coordinates  # (N, D, 1) from p to it
     along = A.transpose(0, 2, 1) @ (A @ away)
-    return p + ((away + along) / 2)[..., 0], np.linalg.norm((away - along)[..., 0], axis=1), values[:, 0] > SINGULAR
+    return p + ((away + along) / 2)[..., 0], np.linalg.norm((away - along)[..., 0], axis=1), differ[:, 0]
 
 
 def orthonormalize(bases: Doubles) -> Doubles:
-    """Return bases that are orthonormal to 1e-14, from bases to 1e-7 (float32), by one Newton step. (N, dim, D)"""
-    return bases + (np.eye(bases.shape[1]) - bases @ bases.transpose(0, 2, 1)) @ bases / 2
+    """Return orthonormal bases of the same spans, to 1e-14: by one Newton step if all are orthonormal to 1e-7. (N, dim, D)"""
+    excess = np.eye(bases.shape[1]) - bases @ bases.transpose(0, 2, 1)
+    if np.abs(excess).max(initial=0.0) > NEARLY_ORTHONORMAL:
+        return np.linalg.qr(bases.transpose(0, 2, 1))[0].transpose(0, 2, 1)
+    return bases + excess @ bases / 2

@@ -20,13 +20,13 @@ from bench.geometry.intersections import (
     concatenate_intersections,
     find_intersections,
     find_intersections_within,
+    orthonormalize,
 )
 from bench.types import Points, Release, Subspaces
 
 BATCH = 16  # releases per batch
 SAMPLE_INTERSECTIONS = 8.0  # expected number for a sample of a release with the same sub-database: 1 sample in 3,000 has none
 PAIRS = 1024  # intersections measured at a time
-EQUAL_TOLERANCE = 1e-5  # points with nearer images on a line count as one
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,12 +104,16 @@ def _select_sharing(target: Subspaces, releases: Sequence[Subspaces], chance: fl
 
 
 def _compute_coverage(intersections: SubspaceIntersections, words: int) -> float:
-    """Return the fraction of words in the `first` subspaces that lie in an intersection. `words` is their number."""
+    """Return the fraction of words in the `first` subspaces that lie in an intersection. `words` is their number.
+
+    Points with images on a line that differ by less than their tolerance count as one.
+    """
     points = intersections.take(intersections.single)
     line = np.random.default_rng(0).normal(size=points.points.shape[1])
     images = points.points @ line
     order = np.lexsort((images, points.first))
-    again = (np.diff(points.first[order]) == 0) & (np.diff(images[order]) < EQUAL_TOLERANCE)
+    tolerances = points.tolerances[order]
+    again = (np.diff(points.first[order]) == 0) & (np.diff(images[order]) < np.maximum(tolerances[1:], tolerances[:-1]))
     return (len(points) - int(again.sum())) / words
 
 
@@ -123,6 +127,7 @@ def compute_intersection_distances(points: Doubles, shared: SharedSubDatabase) -
         pairs = shared.intersections.take(np.arange(start, min(start + PAIRS, len(shared.intersections))))
         other = shared.subspaces.take(pairs.second)
         offsets = points[pairs.first] - other.origins[:, None]  # (P, p, D)
-        outside = offsets - (offsets @ other.bases.transpose(0, 2, 1)) @ other.bases
+        bases = orthonormalize(other.bases.astype(np.float64))
+        outside = offsets - (offsets @ bases.transpose(0, 2, 1)) @ bases
         np.minimum.at(nearest, pairs.first, np.linalg.norm(outside, axis=2))
     return nearest

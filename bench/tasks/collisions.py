@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from bench.api import Attack, Dataset, Defense, Extractor, Lifting, explain_no_words
 from bench.codebook.public import Public
 from bench.core.errors import SampleError, UserError
-from bench.geometry.intersections import INTERSECTION_DISTANCE, Doubles
+from bench.geometry.intersections import Doubles, estimate_tolerances
 from bench.geometry.nearest_words import unit_rows
 from bench.geometry.shared_sub_database import compute_intersection_distances, find_shared_sub_database
 from bench.images.samples import Collection, Images, collect_only_photographs
@@ -70,7 +70,7 @@ class Collisions(Task):
         shared = find_shared_sub_database(lifting.release, trial.others(self.others), defense.adversarial, self.coverage)
         nearest = compute_intersection_distances(points.astype(np.float64), shared)  # (N, 1 + a)
         clear = is_collision_free(nearest, self.tolerance)
-        intersected = nearest[:, 1:] < INTERSECTION_DISTANCE  # (N, a)
+        intersected = nearest[:, 1:] < estimate_tolerances(shared.subspaces).max()  # (N, a)
         covered = intersected.all(axis=1)
         return Outcome(
             metrics={
