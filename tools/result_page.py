@@ -21,7 +21,12 @@ from leaderboard.provenance import format_provenance
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
 SMALL_GALLERY = "gallery:views=40,queries=12,rooms=2"  # a dataset for localization
 RECALLS = {"recall_0.25m_2deg": "0.25 m, 2°", "recall_0.5m_5deg": "0.5 m, 5°", "recall_5m_10deg": "5 m, 10°"}
-PLACEHOLDERS = {"--data": "DATA", "--scene": "fox/", "--work": "WORK"}  # option -> text for its value, a local folder
+PLACEHOLDERS = {
+    "--data": "DATA",
+    "--scene": "fox/",
+    "--weights": "W.safetensors",
+    "--work": "WORK",
+}  # option -> text for its value, a local folder
 
 
 def cache_arrays(tool: str, inputs: Any, compute: Callable[[], Arrays]) -> Arrays:
