@@ -185,6 +185,8 @@ def initialise_from(fresh: AnyNetwork, trained: AnyNetwork, candidates: int) -> 
 def _copy_weights(fresh: GridNetwork, trained: GridNetwork, candidates: int) -> None:
     first = "embed.0.weight"
     old, new = trained.state_dict(), fresh.state_dict()
+    if trained.shape.posteriors and not fresh.shape.posteriors:
+        raise UserError("--initial-checkpoint: that network reads posteriors; pass one for raw descriptors")
     if type(fresh) is not type(trained):  # they share all but the head
         old, new = ({name: state[name] for name in state if name in old and name in new} for state in (old, new))
     if len(fresh.shape.widths) == len(trained.shape.widths):

@@ -294,6 +294,10 @@ def test_it_starts_from_an_inversion_network(rng: np.random.Generator) -> None:
         assert torch.equal(value, source.state_dict()[name])
     with pytest.raises(UserError, match="samples photographs"):
         weights.initialise_from(Inverter(shape), fresh, 1)
+    weighed = Inverter(dataclasses.replace(shape, posteriors=True))
+    for network in (fresh, Inverter(shape)):
+        with pytest.raises(UserError, match="reads posteriors"):
+            weights.initialise_from(network, weighed, 1)
 
 
 def test_hidden_positions_are_refused(tmp_path: Path) -> None:
