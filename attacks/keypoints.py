@@ -41,6 +41,8 @@ class Keypoints(ImageAttack):
         networks = self._list_networks()
         if any(network.meta["encoding"] != "positions" for network in networks):
             return "that network reads descriptors; train one with `bench train --encoding positions`"
+        if any(network.meta.get("model") for network in networks):
+            return "that network samples photographs; train one with `bench train --encoding positions`"
         reasons = [explain_other_features(network.meta, extractor, public) for network in networks]
         return None if None in reasons else reasons[-1]
 

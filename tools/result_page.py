@@ -26,6 +26,7 @@ PLACEHOLDERS = {
     "--images": "PHOTOGRAPHS",
     "--network": "NETWORK",
     "--scene": "fox/",
+    "--weights": "W.safetensors",
     "--work": "WORK",
 }  # option -> text for its value, a local folder
 

@@ -56,6 +56,15 @@ class EncodedRelease(Encoded):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class NoisyRelease(EncodedRelease):
+    """A batch of releases of points, with photographs and noise for a step of flow matching (`bench.inversion.flow`)."""
+
+    photographs: Tensor  # (B, 3, H, W) RGB in [0, 1]
+    noise: Tensor  # (B, 48, H/4, W/4) float32, standard normal
+    time: Tensor  # (B,) float32, from 0 (noise) to 1 (photograph)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class EncodedLines(Encoded):
     """A batch of releases of lines. The position within the cell is zero in `values`."""
 

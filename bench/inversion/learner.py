@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from bench.core.device import pick_device, pick_dtype
-from bench.inversion.encoding import Encoded, EncodedLines
+from bench.inversion.encoding import Encoded, EncodedLines, NoisyRelease
 from bench.inversion.line_network import line_loss
 from bench.inversion.loss import reconstruction_loss
 from bench.inversion.optimizer import Optimizer
@@ -40,6 +40,8 @@ class Learner(Generic[Module]):
         """Return the loss of the network's outputs. -> ()"""
         if isinstance(points, EncodedLines):
             return line_loss(outputs, photographs, points)
+        if isinstance(points, NoisyRelease):
+            return torch.as_tensor(outputs).square().mean()
         return self.loss(outputs, photographs)
 
     def learn(self, points: Encoded, photographs: Tensor, progress: float, parallel: nn.Module | None = None) -> Tensor:

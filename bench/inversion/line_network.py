@@ -112,8 +112,3 @@ def line_loss(output: LineOutput, photographs: Tensor, lines: EncodedLines) -> T
     if lines.truth is None:
         raise ValueError("these lines were encoded without the true keypoints")
     return reconstruction_loss(output.images, photographs) + POSTERIOR_WEIGHT * nnf.nll_loss(output.logs, lines.truth)
-
-
-def build_network(shape: Shape) -> Inverter | LineInverter:
-    """Return a network of this shape with random weights."""
-    return LineInverter(shape) if shape.samples else Inverter(shape)

@@ -10,6 +10,7 @@ If several keypoints lie in one cell, their embeddings are summed, and an extra 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -38,8 +39,8 @@ class Shape:
     samples: int = 0  # points on each line of a network that reads lines (`bench.inversion.line_network`); 0: it reads points
 
 
-class Inverter(nn.Module):
-    """Points of B releases -> (B, 3, H, W) RGB, unclamped."""
+class GridNetwork(nn.Module):
+    """Points of B releases -> features of each cell: the part that all networks for points have in common."""
 
     def __init__(self, shape: Shape) -> None:
         super().__init__()
@@ -57,32 +58,30 @@ class Inverter(nn.Module):
             self.alone = nn.Sequential(nn.Linear(5, 64), nn.SiLU(), nn.Linear(64, shape.hidden))
         self.own = nn.Linear(shape.hidden, first - 1)
         self.around = nn.Linear(shape.hidden, shape.patch**2 * shape.painted)
-        self.stem = conv_norm(first + shape.painted, first)
+        self.channels = first + shape.painted  # of the grid
+        self.stem = conv_norm(self.channels, first)
         pairs = list(itertools.pairwise(shape.widths))
         self.down = nn.ModuleList(nn.Sequential(conv_norm(narrow, wide, stride=2), Residual(wide)) for narrow, wide in pairs)
         self.up = nn.ModuleList(Up(wide, narrow) for narrow, wide in reversed(pairs))
-        self.narrow = nn.Conv2d(first, shape.last, 1)
-        self.refine = conv_norm(shape.last, shape.last)
-        self.paint = nn.Conv2d(shape.last, 3 * (CELL // 2) ** 2, 3, padding=1)
 
-    def forward(self, points: EncodedRelease) -> Tensor:
-        return self.decode(self.scatter(points), points.size)
+    def refine_grid(self, cells: Tensor, shifts: Sequence[Tensor] | None = None) -> Tensor:
+        """The U-Net. (B, first + painted, H/4, W/4) -> (B, first, H/4, W/4), with a margin up to a multiple of the deepest level
 
-    def decode(self, cells: Tensor, size: tuple[int, int]) -> Tensor:
-        """Reconstruct photographs of H, W pixels from a grid. (B, first + painted, H/4, W/4) -> (B, 3, H, W)"""
+        `shifts` (B, width, 1, 1) are added to the levels on the way down.
+        """
         rows, columns = cells.shape[2:]
         step = 2 ** len(self.down)  # cell size of the deepest level; other image sizes get an empty margin
-        margin = (0, -columns % step, 0, -rows % step)
-        level = self.stem(nnf.pad(cells, margin))
-        levels = [level]
-        for down in self.down:
-            levels.append(down(levels[-1]))
+        level = nnf.pad(cells, (0, -columns % step, 0, -rows % step))
+        levels = []
+        for number, down in enumerate((self.stem, *self.down)):
+            level = down(level)
+            if shifts is not None:
+                level = level + shifts[number]
+            levels.append(level)
         level = levels.pop()
         for up in self.up:
             level = up(level, levels.pop())
-        half = self.refine(upsample(self.narrow(level)))
-        images = nnf.pixel_shuffle(self.paint(half).float(), CELL // 2) + 0.5
-        return images[:, :, : size[0], : size[1]]
+        return level
 
     def scatter(self, points: EncodedRelease) -> Tensor:
         """Sum the embeddings and patches of keypoints in a grid. -> (B, first + painted, H/4, W/4), channels last"""
@@ -141,6 +140,25 @@ class Inverter(nn.Module):
         hidden = self.embed(torch.cat([candidates, within[:, None].expand(-1, count, -1)], dim=2))  # (P, m, hidden)
         summed = (hidden * weights[:, :, None]).sum(dim=1)
         return summed + self.alone(torch.cat([within, defense, none.clamp(min=MIN_LOG_POSTERIOR) / 4], dim=1))
+
+
+class Inverter(GridNetwork):
+    """Points of B releases -> (B, 3, H, W) RGB, unclamped."""
+
+    def __init__(self, shape: Shape) -> None:
+        super().__init__(shape)
+        self.narrow = nn.Conv2d(shape.widths[0], shape.last, 1)
+        self.refine = conv_norm(shape.last, shape.last)
+        self.paint = nn.Conv2d(shape.last, 3 * (CELL // 2) ** 2, 3, padding=1)
+
+    def forward(self, points: EncodedRelease) -> Tensor:
+        return self.decode(self.scatter(points), points.size)
+
+    def decode(self, cells: Tensor, size: tuple[int, int]) -> Tensor:
+        """Reconstruct photographs of H, W pixels from a grid. (B, first + painted, H/4, W/4) -> (B, 3, H, W)"""
+        half = self.refine(upsample(self.narrow(self.refine_grid(cells))))
+        images = nnf.pixel_shuffle(self.paint(half).float(), CELL // 2) + 0.5
+        return images[:, :, : size[0], : size[1]]
 
 
 def conv_norm(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:

@@ -34,6 +34,7 @@ def build_key(plan: Plan) -> dict[str, Any]:
         "crossfit": [public.digest(asset) for asset in plan.crossfit],
         "start": None if plan.initial_checkpoint is None else weights.load(plan.initial_checkpoint).digest,
         "encoding": plan.encoding,
+        "model": plan.model,
         "keypoints": plan.keypoints,
         "widths": list(plan.widths),
         "training": dataclasses.asdict(plan.training),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from bench.api import Extractor
 from bench.core.errors import UserError
@@ -14,6 +15,8 @@ from bench.inversion.data import Target
 from bench.inversion.encoding import Encoding
 from bench.inversion.network import COARSENET, Shape
 from bench.settings import Asset
+
+Model = Literal["inversion", "flow"]  # a network that reconstructs the photograph, or one that samples photographs
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,6 +47,7 @@ class Plan:
     crossfit: Sequence[Asset] = ()  # dictionaries for photographs that the defense's own was built from
     initial_checkpoint: Path | None = None  # a network for the same kind of releases or for raw descriptors; None: random weights
     encoding: Encoding = "invariant"  # input of the network
+    model: Model = "inversion"
     widths: tuple[int, ...] = Shape.widths  # of the network's levels
     training: Training = Training()  # frozen
     keypoints: tuple[int, int] | None = None  # limits of each view's `max_keypoints`, drawn at random; None: the extractor's

@@ -10,8 +10,9 @@ from torch import Tensor, nn
 
 from bench.core.device import pick_dtype
 from bench.inversion.encoding import Encoded, Encoding, encode, encode_lines, sample_lines
+from bench.inversion.flow import FlowNetwork
+from bench.inversion.kinds import AnyNetwork
 from bench.inversion.line_network import LineInverter, LineOutput
-from bench.inversion.network import Inverter
 from bench.inversion.symmetry import AnyRelease, Symmetry
 from bench.types import Floats, Release
 
@@ -19,14 +20,22 @@ REACH = 15.0  # pixels; an error of a position beyond it costs no more; as of th
 
 
 def reconstruct_image(
-    module: Inverter | LineInverter,
+    module: AnyNetwork,
     release: Release,
     symmetries: Sequence[Symmetry],
     settings: Floats,
     slots: int,
     encoding: Encoding,
 ) -> Floats:
-    """Return the mean reconstruction of a release. -> (H, W, 3) in [0, 1]"""
+    """Return the mean reconstruction of a release. -> (H, W, 3) in [0, 1]
+
+    Raises
+    ------
+    TypeError
+        if the network samples photographs (`bench.inversion.flow`).
+    """
+    if isinstance(module, FlowNetwork):
+        raise TypeError("the network samples photographs, and reconstructs none")
     samples = module.shape.samples
 
     def encode_one(transformed: Release) -> Encoded:

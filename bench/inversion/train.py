@@ -37,12 +37,14 @@ from bench.inversion.data import (
     measure_quantisation_error,
     quantise,
 )
-from bench.inversion.encoding import Encoded, Encoding, encode, encode_lines, stack
+from bench.inversion.encoding import Encoded, EncodedRelease, Encoding, encode, encode_lines, stack
+from bench.inversion.flow import FlowNetwork, add_noise, measure_loss, sample_images
+from bench.inversion.kinds import AnyNetwork, build_network
 from bench.inversion.learner import Learner
-from bench.inversion.line_network import SAMPLES, LineInverter, build_network
+from bench.inversion.line_network import SAMPLES, LineInverter
 from bench.inversion.log import Log
 from bench.inversion.loss import ssim
-from bench.inversion.network import Inverter, Shape
+from bench.inversion.network import Shape
 from bench.inversion.plan import Plan, Training
 from bench.inversion.process_group import ProcessGroup, launch
 from bench.inversion.reconstruct import infer, locate_keypoints
@@ -53,6 +55,7 @@ from bench.types import Subspaces, WordSets
 CHECKPOINT = "inversion-checkpoint"
 CHECKPOINT_EVERY = 250  # steps
 MAX_VALIDATED = 100  # photographs
+VALIDATION_STEPS = 8  # of the solver, for a network that samples photographs
 MAX_IN_MEMORY = 2000  # photographs, about 6 GB; with more photographs, views are computed on demand
 MAX_COMPARED = 1000  # training photographs for the comparison of quantisation errors
 TOLERANCE = 0.05  # relative difference of the quantisation errors on training and on unseen photographs
@@ -94,6 +97,8 @@ def train_worker(group: ProcessGroup, plan: Plan, out: Path, log: Path | None) -
     slots, length = _measure_stack(held_out, unseen[0], encoding)
     first = held_out.release_view(unseen[0], np.random.default_rng(0))
     samples = _count_samples(targets, encoding)
+    if plan.model == "flow" and samples:
+        raise UserError("--model flow: it reads points, and the defense hides positions; pass another --defense")
     sample, _ = build_batch([first], slots, encoding, samples)
     candidates = slots if encoding == "invariant" and sets else 0
     shape = Shape(inputs=sample.values.shape[1], candidates=candidates, length=length, widths=plan.widths, samples=samples)
@@ -101,6 +106,7 @@ def train_worker(group: ProcessGroup, plan: Plan, out: Path, log: Path | None) -
     meta = {
         **weights.describe(targets, extractor, Public(), plan.keypoints),
         "encoding": encoding,
+        "model": plan.model if plan.model != "inversion" else None,
         "slots": slots,
         "start": initial and initial.digest,
         "earlier": [] if initial is None else weights.list_training_stages(initial.meta),
@@ -118,9 +124,9 @@ def train_worker(group: ProcessGroup, plan: Plan, out: Path, log: Path | None) -
         _check_same_training(out, finished, meta)
         return finished
     trainer = _Trainer(group, shape, training, out, meta, writer)
-    if initial is not None and trainer.step == 0:
+    if trainer.step == 0:
         descriptor_slots = slots if sets and not candidates else 1
-        trainer.load_initial_checkpoint(initial.module, descriptor_slots)
+        trainer.initialise(views, None if initial is None else initial.module, descriptor_slots)
     module = trainer.run(examples)
     if not group.is_main:
         return meta
@@ -159,13 +165,17 @@ def _build_examples(
         Examples(views, targets, assigned, public),
         Examples(unseen, targets, assigned_unseen, plain),
     )
-    compared = views[:: 4 * math.ceil(len(views) / (4 * MAX_COMPARED))]  # unmirrored, at 256 pixels
     errors = {
-        "training": measure_quantisation_error(compared, assigned, public, sizes[0]),
+        "training": measure_quantisation_error(select_views(views), assigned, public, sizes[0]),
         "validation": measure_quantisation_error(unseen, assigned_unseen, plain, sizes[0]),
     }
     check_quantisation(errors["training"], errors["validation"])
     return examples, held_out, errors
+
+
+def select_views(views: Sequence[PhotographView]) -> Sequence[PhotographView]:
+    """Return the unmirrored view at 256 pixels of at most `MAX_COMPARED` photographs."""
+    return views[:: 4 * math.ceil(len(views) / (4 * MAX_COMPARED))]
 
 
 def _check_targets(targets: Sequence[Target]) -> bool:
@@ -271,23 +281,26 @@ def _checkpoint_path(out: Path) -> Path:
     return out.with_name(out.name + ".checkpoint")
 
 
-class _Trainer(Learner[Inverter | LineInverter]):
+class _Trainer(Learner[AnyNetwork]):
     """A learner with its part of each batch, and a checkpoint to resume from."""
 
     def __init__(self, group: ProcessGroup, shape: Shape, training: Training, out: Path, meta: dict[str, Any], log: Log) -> None:
         torch.manual_seed(training.seed)
-        super().__init__(build_network(shape), training)
+        super().__init__(build_network(shape, meta["model"]), training)
         self.group, self.meta, self.log = group, meta, log
         self.path = _checkpoint_path(out)
         if self.path.is_file():
             self._restore()
 
-    def load_initial_checkpoint(self, trained: Inverter | LineInverter, candidates: int) -> None:
-        """Initialise weights and average from another network."""
-        weights.initialise_from(self.module, trained, candidates)
+    def initialise(self, views: Sequence[PhotographView], trained: AnyNetwork | None, candidates: int) -> None:
+        """Initialise weights and average, from another network if there is one."""
+        if isinstance(self.module, FlowNetwork):
+            self.module.measure_coefficients(view.pixels for view in select_views(views))
+        if trained is not None:
+            weights.initialise_from(self.module, trained, candidates)
         self.reset_average()
 
-    def run(self, examples: Examples) -> Inverter | LineInverter:
+    def run(self, examples: Examples) -> AnyNetwork:
         """Train to the end, and return the network with averaged weights."""
         if self.step == self.training.steps:
             return self.load_average()
@@ -310,8 +323,10 @@ class _Trainer(Learner[Inverter | LineInverter]):
         training, indices = self.training, self.group.assign_indices(self.training.batch)
 
         def build(step: int) -> tuple[Encoded, Tensor]:
-            batch = [examples.draw(np.random.default_rng([training.seed, step, index])) for index in indices]
-            return build_batch(batch, self.meta["slots"], self.meta["encoding"], self.module.shape.samples)
+            rngs = [np.random.default_rng([training.seed, step, index]) for index in indices]
+            batch = [examples.draw(rng) for rng in rngs]
+            points, photographs = build_batch(batch, self.meta["slots"], self.meta["encoding"], self.module.shape.samples)
+            return (add_noise(points, photographs, rngs) if isinstance(self.module, FlowNetwork) else points), photographs
 
         workers = max(1, (os.cpu_count() or 1) // self.group.size) if isinstance(examples.views, LazyViews) else 1
         with ThreadPoolExecutor(workers) as executor:
@@ -365,24 +380,30 @@ def build_batch(examples: Sequence[Example], slots: int, encoding: Encoding, sam
 
 
 def validate(
-    module: Inverter | LineInverter, examples: Examples, views: Sequence[PhotographView], slots: int, encoding: Encoding
+    module: AnyNetwork, examples: Examples, views: Sequence[PhotographView], slots: int, encoding: Encoding
 ) -> dict[str, float]:
     """Return mean MAE, SSIM (where its window fits) and PSNR over whole views. Settings are drawn with a fixed seed.
 
-    For lines also the mean over views of the median position error in pixels.
+    For lines also the mean over views of the median position error in pixels. A network that samples photographs draws one
+    of each view, and `flow-loss` is its mean training loss.
     """
     device, rng = pick_device(), np.random.default_rng(0)
-    scores, errors = [], []
+    scores, errors, losses = [], [], []
     for view in views:
         example = examples.release_view(view, rng)
         points, truth = build_batch([example], slots, encoding, module.shape.samples)
-        scores.append(score(infer(module, points.to(device)).cpu()[0], truth[0]))
+        if isinstance(module, FlowNetwork) and isinstance(points, EncodedRelease):
+            images = sample_images(module, points, 1, VALIDATION_STEPS, 1.0, rng)
+            losses.append(measure_loss(module, add_noise(points, truth, [rng])))
+        else:
+            images = infer(module, points.to(device))
+        scores.append(score(images.cpu()[0], truth[0]))
         if isinstance(module, LineInverter):
             located = locate_keypoints(module, example.release, [IDENTITY], example.settings, slots, encoding)
             errors.append(np.median(np.linalg.norm(located - example.keypoints, axis=1)))
     mae, similarity, psnr = np.mean(scores, axis=0)
-    positions = {"position-error": float(np.mean(errors))} if errors else {}
-    return {"photographs": len(views), "mae": float(mae), "ssim": float(similarity), "psnr": float(psnr)} | positions
+    more = {name: float(np.mean(values)) for name, values in (("position-error", errors), ("flow-loss", losses)) if values}
+    return {"photographs": len(views), "mae": float(mae), "ssim": float(similarity), "psnr": float(psnr)} | more
 
 
 def score(reconstruction: Tensor, photograph: Tensor) -> tuple[float, float, float]:

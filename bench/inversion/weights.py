@@ -27,11 +27,12 @@ if TYPE_CHECKING:
     from torch import nn
 
     from bench.inversion.data import Target
-    from bench.inversion.line_network import LineInverter
-    from bench.inversion.network import Inverter, Shape
+    from bench.inversion.kinds import AnyNetwork
+    from bench.inversion.network import GridNetwork, Shape
 
 KIND = "inversion-network"
 REQUIRED_METADATA = ("defense", "encoding", "extractor", "serves", "shape", "slots")  # metadata for inference
+MODELS = {None: "reconstructs the photograph", "flow": "samples photographs"}  # metadata `model` -> what the network does
 STAGE_METADATA = ("start", "crops", "batch", "photographs", "rate", "symmetries")  # metadata of each training stage
 
 
@@ -40,7 +41,7 @@ class Network(NetworkFile):
     """A trained network, ready for inference."""
 
     @cached_property
-    def module(self) -> Inverter | LineInverter:
+    def module(self) -> AnyNetwork:
         """The network itself, built at first use.
 
         Raises
@@ -51,11 +52,11 @@ class Network(NetworkFile):
         import torch
 
         from bench.core.device import pick_device
-        from bench.inversion.line_network import build_network
+        from bench.inversion.kinds import build_network
         from bench.inversion.network import Shape
 
-        shape = self.meta["shape"]
-        module = build_module(self.path, lambda: build_network(Shape(**{**shape, "widths": tuple(shape["widths"])})))
+        shape, model = self.meta["shape"], self.meta.get("model")
+        module = build_module(self.path, lambda: build_network(Shape(**{**shape, "widths": tuple(shape["widths"])}), model))
         for name, value in module.state_dict().items():
             if not value.is_floating_point():
                 continue  # batch norm's counter of batches, used in training only
@@ -129,6 +130,8 @@ def _are_metadata(meta: dict[str, Any]) -> bool:
     supported = [target.get("serves") for target in targets]
     if not all(isinstance(settings, dict) and all(map(_is_setting, settings.values())) for settings in supported):
         return False
+    if meta.get("model") not in list(MODELS):
+        return False
     return isinstance(meta["shape"], dict) and type(meta["slots"]) is int and meta["encoding"] in get_args(Encoding)
 
 
@@ -142,7 +145,7 @@ def _is_setting(text: Any) -> bool:
     return isinstance(values, list) and all(isinstance(value, str | int | float | None) for value in values)
 
 
-def initialise_from(fresh: Inverter | LineInverter, trained: Inverter | LineInverter, candidates: int) -> None:
+def initialise_from(fresh: AnyNetwork, trained: AnyNetwork, candidates: int) -> None:
     """Initialise a network from a network for the same kind of release, or for raw descriptors.
 
     From a network for raw descriptors, the first layer treats the first `candidates` slots as descriptors. These are the words of
@@ -151,7 +154,8 @@ def initialise_from(fresh: Inverter | LineInverter, trained: Inverter | LineInve
     another length, they are other features: the first layer remains as it is.
 
     If the levels are narrower, they take the first channels of each level of `trained`. A network that reads lines takes its
-    inversion network from one that reads points.
+    inversion network from one that reads points. A network that samples photographs takes from an inversion network all but
+    the head.
 
     Raises
     ------
@@ -160,8 +164,11 @@ def initialise_from(fresh: Inverter | LineInverter, trained: Inverter | LineInve
     """
     import torch
 
+    from bench.inversion.flow import FlowNetwork
     from bench.inversion.line_network import LineInverter
 
+    if isinstance(trained, FlowNetwork) and not isinstance(fresh, FlowNetwork):
+        raise UserError("--initial-checkpoint: that network samples photographs; pass one that reconstructs them")
     with torch.no_grad():
         if isinstance(trained, LineInverter):
             if not isinstance(fresh, LineInverter):
@@ -175,9 +182,13 @@ def initialise_from(fresh: Inverter | LineInverter, trained: Inverter | LineInve
             _copy_weights(fresh, trained, candidates)
 
 
-def _copy_weights(fresh: Inverter, trained: Inverter, candidates: int) -> None:
+def _copy_weights(fresh: GridNetwork, trained: GridNetwork, candidates: int) -> None:
     first = "embed.0.weight"
     old, new = trained.state_dict(), fresh.state_dict()
+    if trained.shape.posteriors and not fresh.shape.posteriors:
+        raise UserError("--initial-checkpoint: that network reads posteriors; pass one for raw descriptors")
+    if type(fresh) is not type(trained):  # they share all but the head
+        old, new = ({name: state[name] for name in state if name in old and name in new} for state in (old, new))
     if len(fresh.shape.widths) == len(trained.shape.widths):
         old = {name: value[tuple(map(slice, new[name].shape))] if name != first else value for name, value in old.items()}
     if any(old[name].shape != value.shape for name, value in new.items() if name != first):
@@ -256,16 +267,25 @@ def explain_incompatible(meta: dict[str, Any], defense: Defense, extractor: Extr
 
 
 def find_network(
-    asset: str, shipped: Mapping[str, str], defense: Defense, extractor: Extractor, public: Public
+    asset: str,
+    shipped: Mapping[str, str],
+    defense: Defense,
+    extractor: Extractor,
+    public: Public,
+    model: str | None = None,
 ) -> tuple[Path | None, str]:
     """Return the path of a network for these releases, or the reasons in brackets why none of the networks suits.
 
-    `asset` is a file, or a name of shipped networks: `shipped` has the pattern of their files for each name.
+    `asset` is a file, or a name of shipped networks: `shipped` has the pattern of their files for each name. `model` is a key of
+    `MODELS`.
     """
     candidates = sorted(ASSETS.glob(shipped[asset])) if asset in shipped else [Path(asset)]
     reasons = []
     for path in candidates:
         meta = load(path).meta
+        if meta.get("model") != model:
+            reasons.append(f"{path.name} is a network that {MODELS[meta.get('model')]}")
+            continue
         reason = explain_incompatible(meta, defense, extractor, public)
         if reason is None:
             return path, ""

@@ -35,6 +35,7 @@ SMALLER = {
     "train --defense lines --images photos/ --out W.safetensors --widths 32,64,112,56 --steps 2500": (
         "--steps 1 --batch 1 --widths 8,8"
     ),
+    "train --model flow --defense none --images photos/ --out F.safetensors": "--steps 1 --batch 1 --widths 8,8",
     "run --defense lines --attack dia-lines:weights=W.safetensors --attack neighbourhood": "--images one/",
     "cost --markdown": "--words 1000",
     "dictionary build --images other-photos/ --extractor xfeat --size 16000 --out words.safetensors": "--size 1600",

@@ -41,6 +41,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="network input: release without random order or basis, unchanged release, or positions (default: %(default)s)",
     )
     parser.add_argument(
+        "--model",
+        choices=("inversion", "flow"),
+        default="inversion",
+        help="a network that reconstructs the photograph, or one that samples photographs for the attack generative "
+        "(default: %(default)s)",
+    )
+    parser.add_argument(
         "--profile",
         choices=("cpu", "paper"),
         default="cpu",
@@ -96,6 +103,7 @@ def execute(args: argparse.Namespace) -> int:
         crossfit=[Asset(file) for file in args.crossfit],
         initial_checkpoint=args.initial_checkpoint,
         encoding=args.encoding,
+        model=args.model,
         widths=args.widths or profile.widths,
         training=dataclasses.replace(profile.training, **overrides),
         keypoints=args.keypoints,

@@ -1,0 +1,92 @@
+"""Generative attack: samples photographs given the release, by conditional flow matching.
+
+Source: Lipman et al., ICLR 2023, for flow matching. The use on releases of features is ours; work on privacy of visual
+localization uses conditional diffusion likewise.
+
+Method (`bench/inversion/flow.py`):
+
+1. Encode each keypoint of the release as `dia` does, and scatter the embeddings to a grid of cells of 4 x 4 pixels.
+2. Start at Gaussian noise and follow a learned velocity to a photograph, in `steps` steps of Heun's method.
+3. With `guidance` w, the velocity is u + w (v - u), for the velocity v given the release and the velocity u of the prior.
+4. Return the mean of `samples` samples.
+
+A regression network answers uncertainty by blur. A sample is one photograph that may have this release. The mean of many samples
+estimates the posterior mean, which blurs all that the release does not determine. Guidance 0 does not read the release: its
+samples are those of the prior, a control.
+
+Knowledge: a network trained on public photographs for that distribution of releases.
+
+Limits: as those of `dia`. It does not read hidden positions. The choice of the best sample would need the photograph, so no field
+offers it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from bench.api import Defense, Extractor, ImageAttack, View
+from bench.codebook.public import Public
+from bench.core.errors import UserError
+from bench.inversion.weights import Network, find_network, load
+from bench.settings import Asset
+from bench.threat_model import PublicAssets
+from bench.types import Descriptors, Floats, Subspaces, WordSets
+
+SHIPPED = {"shipped": "flow-*.safetensors"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Generative(ImageAttack):
+    """Samples photographs given the release with a network trained for the defense, and returns their mean."""
+
+    accepts = (Descriptors, WordSets, Subspaces)
+    needs = frozenset({PublicAssets})
+
+    weights: Asset = Asset("shipped")
+    samples: int = 1
+    steps: int = 12  # of the solver, with two evaluations of the velocity each
+    guidance: float = 1.0  # 0: the prior; 1: the posterior; more: images that are likelier for this release than for others
+
+    def __post_init__(self) -> None:
+        if self.samples < 1 or self.steps < 1:
+            raise UserError(f"generative: samples and steps must be at least 1, got {self.samples} and {self.steps}")
+        if not (self.guidance >= 0 and math.isfinite(self.guidance)):
+            raise UserError(f"generative: guidance must be finite and at least 0, got {self.guidance}")
+
+    def explain_incompatible(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
+        path, details = find_network(self.weights, SHIPPED, defense, extractor, public, model="flow")
+        if path is not None:
+            return None
+        return f"no adapted attacker{details}; train one with `bench train --model flow` and pass generative:weights=FILE"
+
+    def assets(self, defense: Defense, extractor: Extractor, public: Public) -> Mapping[str, str]:
+        return {"weights": self._network(defense, extractor, public).verify()}
+
+    def reconstruct(self, view: View, rng: np.random.Generator) -> Floats:
+        return self.sample(view, rng).mean(axis=0, dtype=np.float32)
+
+    def sample(self, view: View, rng: np.random.Generator) -> Floats:
+        """Return the samples. -> (samples, H, W, 3) float32 in [0, 1]"""
+        from bench.inversion.encoding import encode
+        from bench.inversion.flow import FlowNetwork, sample_images
+
+        public = view.know(PublicAssets).assets
+        network = self._network(view.defense, view.extractor, public)
+        settings, module = network.encode_settings(view.defense, public), network.module
+        assert isinstance(module, FlowNetwork)  # by the metadata
+        points = encode([view.release], [settings], network.meta["slots"], network.meta["encoding"])
+        images = sample_images(module, points, self.samples, self.steps, self.guidance, rng)
+        return images.permute(0, 2, 3, 1).cpu().numpy()
+
+    def _network(self, defense: Defense, extractor: Extractor, public: Public) -> Network:
+        path, details = find_network(self.weights, SHIPPED, defense, extractor, public, model="flow")
+        if path is None:
+            raise UserError(f"generative: no adapted attacker{details}")
+        return load(path)
+
+
+PLUGIN = Generative
