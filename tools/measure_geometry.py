@@ -13,12 +13,13 @@ Records in WORK are reused, so an interrupted run resumes.
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from result_page import RECALLS, SMALL_GALLERY, format_interval, list_values, write_page
+from result_page import RECALLS, SMALL_GALLERY, format_command, format_interval, list_values, write_page
 
 import bench
 from bench.core.table import markdown_row
@@ -26,6 +27,7 @@ from bench.registry import discovery, spec
 from bench.runner.records import Record
 from leaderboard.intervals import interval
 from leaderboard.plot_style import choose_styles
+from leaderboard.provenance import CHUNK, format_provenance
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -86,8 +88,10 @@ def main() -> None:
     photographed, defenses = f"captured:path={args.scene}", LOCALIZED if args.scene else ()
     in_scene = {defense: localize(defense, photographed, args.work / "scene") for defense in defenses}
     attacked = {pair: attack_positions(*pair, args.work / "attacks") for pair in pairs}
-    draw_tradeoff(attacked, in_gallery).savefig(PICTURE, dpi=110)
     results = (attacked, served, in_gallery, in_scene)
+    records = [record for some in results for each in some.values() for record in each]
+    provenance = {CHUNK: format_provenance(format_command(sys.argv), records)}
+    draw_tradeoff(attacked, in_gallery).savefig(PICTURE, dpi=110, metadata=provenance)
     parts = [
         TITLE,
         write_attacks(attacked, ON_PHOTOGRAPHS),
@@ -98,7 +102,7 @@ def main() -> None:
     if args.scene:
         caption = "Dataset `captured:path=fox/`, a photographed scene; every fifth photograph is a query"
         parts.append(write_localization(in_scene, caption))
-    write_page("geometry.md", "\n".join(parts), [record for some in results for each in some.values() for record in each])
+    write_page("geometry.md", "\n".join(parts), records)
 
 
 def attack_positions(defense: str, attack: str, work: Path, dataset: str | None = None) -> list[Record]:
