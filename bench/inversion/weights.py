@@ -98,7 +98,7 @@ def load(path: Path) -> Network:
     return _load(path, status and (status.st_mtime_ns, status.st_size))
 
 
-@functools.lru_cache(maxsize=8)
+@functools.lru_cache(maxsize=32)  # more than there are shipped files
 def _load(path: Path, version: object) -> Network:
     arrays, meta, digest = tensor_file.load(path, KIND)
     missing = [key for key in REQUIRED_METADATA if key not in meta]
