@@ -64,7 +64,9 @@ def test_posteriors_improve_the_reconstruction_and_those_of_other_keypoints_do_n
     assert scores[0] > max(scores[1:]) + 0.05, scores
 
 
-def test_order_of_the_candidates_has_no_effect(pixels, network, context):
+def test_order_of_the_candidates_has_no_effect(pixels, network, context, monkeypatch):
+    """In float32. In bf16 the sums of the candidates round differently: by up to 0.04 in a few pixels."""
+    monkeypatch.setattr("bench.inversion.reconstruct.pick_dtype", lambda device: torch.float32)
     defense = LDP(epsilon=12.0, subset_size=3)
     release = release_photograph(pixels, defense)
     turned = dataclasses.replace(
@@ -72,7 +74,7 @@ def test_order_of_the_candidates_has_no_effect(pixels, network, context):
     )
     odds = prior_odds(defense, Public(), 3)
     images = [reconstruct_from_posteriors(network.module, context.module, one, odds, [IDENTITY]) for one in (release, turned)]
-    np.testing.assert_allclose(images[0], images[1], atol=0.02)
+    np.testing.assert_allclose(images[0], images[1], atol=1e-4)
     assert images[0].std() > 0.1
 
 
