@@ -52,28 +52,8 @@ ALIKED = "aliked:detection_threshold=0"
 TRAININGS = (
     Training(file="inversion-none", defenses=("none",), steps=4500, rate=2e-3, photographs="2", initial="start"),
     Training(file="inversion-affine", defenses=("affine",), steps=4500, rate=2e-3, photographs="2", initial="start"),
-    Training(
-        file="inversion-lifting",
-        defenses=("affine:lifting=random", "affine:lifting=adversarial"),
-        steps=2600,
-        photographs="2",
-        initial="inversion-affine",
-        widths=NARROW,
-    ),
     Training(file="positions", defenses=("none",), steps=4500, rate=4e-3, initial=None, options=("--encoding", "positions")),
     Training(file="inversion-oriented", defenses=("none",), steps=20_800, rate=4e-3, initial=None, options=ORIENTED),
-    *(
-        Training(
-            file=f"inversion-oriented-{defense}",
-            defenses=(defense,),
-            steps=2600,
-            photographs="2",
-            initial="inversion-oriented",
-            widths=NARROW,
-            options=ORIENTED,
-        )
-        for defense in ("affine", "ldp")
-    ),
     Training(
         file="inversion-xfeat",
         defenses=("none", "ldp:dictionary=shipped-xfeat,words=0"),
