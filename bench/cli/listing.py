@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from rich.text import Text
@@ -11,7 +11,6 @@ from rich.text import Text
 from bench.api import Plugin
 from bench.codebook.public import Public
 from bench.core.errors import UserError
-from bench.core.table import Table, build_table
 from bench.registry import discovery, fields, spec
 from bench.registry.discovery import Kind
 
@@ -25,8 +24,8 @@ SECTIONS: dict[str, Kind] = {
 }
 
 
-def build_listing(section: str | None) -> Iterator[Table | Text]:
-    """Yield one section, or all sections. With defenses or attacks, the table of applicability follows.
+def build_listing(section: str | None) -> Iterator[Text]:
+    """Yield one section, or all sections. With defenses or attacks, the applicability of attacks follows.
 
     Raises
     ------
@@ -38,7 +37,7 @@ def build_listing(section: str | None) -> Iterator[Table | Text]:
         for plugin in discovery.load_plugins(SECTIONS[name]):
             yield from _describe(plugin)
     if section in (None, "defenses", "attacks"):
-        yield _build_matrix()
+        yield from _list_applicability()
 
 
 def _describe(plugin: type[Plugin]) -> Iterator[Text]:
@@ -48,26 +47,32 @@ def _describe(plugin: type[Plugin]) -> Iterator[Text]:
     for field in dataclasses.fields(plugin):  # type: ignore[arg-type]
         default = "required" if field.default is dataclasses.MISSING else f"default {_format(field.default)}"
         rows.append((field.name, fields.describe_type(types[field.name]) or "", default))
-    name, kind = (max((len(row[index]) for row in rows), default=0) for index in (0, 1))
-    yield from (Text(f"       {row[0]:{name}}  {row[1]:{kind}}  {row[2]}") for row in rows)  # a table of rich is slow
+    yield from _align(rows)
+
+
+def _align(rows: Sequence[tuple[str, str, str]]) -> Iterator[Text]:
+    """Yield rows of three columns. A table of rich is slow."""
+    first, second = (max((len(row[index]) for row in rows), default=0) for index in (0, 1))
+    yield from (Text(f"       {row[0]:{first}}  {row[1]:{second}}  {row[2]}".rstrip()) for row in rows)
 
 
 def _format(value: Any) -> str:
     return str(value).lower() if isinstance(value, bool) or value is None else str(value)
 
 
-def _build_matrix() -> Table:
-    """Return the table of the applicability of each attack to each defense, with default fields."""
+def _list_applicability() -> Iterator[Text]:
+    """Yield for each defense the attacks, whether they apply with default fields, and the reason if not."""
+    yield Text("\nwhich attack applies to which defense (with default fields)", style="bold")
     public = Public()
     task, extractor = spec.read("reconstruction", discovery.TASK), spec.read("sift", discovery.EXTRACTOR)
-    defenses, attacks = discovery.load_plugins(discovery.DEFENSE), discovery.load_plugins(discovery.ATTACK)
-    rows = []
-    for defense in defenses:
+    attacks = discovery.load_plugins(discovery.ATTACK)
+    for defense in discovery.load_plugins(discovery.DEFENSE):
+        rows = []
         for attack in attacks:
             try:
                 reason = task.explain_not_applicable(spec.build(defense, {}), spec.build(attack, {}), extractor, public)
             except UserError as error:  # a required field or a file is missing
                 reason = str(error)
-            rows.append((defense.name(), attack.name(), "no" if reason else "yes", reason or ""))
-    columns = ("defense", "attack", "applies", "reason")
-    return build_table(columns, rows, text=columns, heading="which attack applies to which defense (with default fields)")
+            rows.append((attack.name(), "no" if reason else "yes", reason or ""))
+        yield Text.assemble("  ", (defense.name(), "bold"))
+        yield from _align(rows)
