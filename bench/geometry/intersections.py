@@ -71,13 +71,15 @@ def find_intersections(one: Subspaces, other: Subspaces) -> SubspaceIntersection
     UserError
         if their dimensions add up to D or more, where all pairs intersect.
     """
-    return _decide_pairs(one, other, _screen_pairs(one, other))
+    errors = _measure_errors(one), _measure_errors(other)
+    return _decide_pairs(one, other, errors, _screen_pairs(one, other, errors))
 
 
 def find_intersections_within(release: Subspaces) -> SubspaceIntersections:
     """Return all intersecting pairs of different subspaces of one release, each pair once, with `first` < `second`."""
-    pairs = ((first, second) for first, second in _screen_pairs(release, release, triangle=True))
-    return _decide_pairs(release, release, ((first[first < second], second[first < second]) for first, second in pairs))
+    errors = (_measure_errors(release),) * 2
+    pairs = _screen_pairs(release, release, errors, triangle=True)
+    return _decide_pairs(release, release, errors, ((first[first < second], second[first < second]) for first, second in pairs))
 
 
 def concatenate_intersections(parts: Sequence[SubspaceIntersections]) -> SubspaceIntersections:
@@ -93,16 +95,25 @@ def concatenate_intersections(parts: Sequence[SubspaceIntersections]) -> Subspac
 
 def estimate_tolerances(release: Subspaces) -> Doubles:
     """Return for each subspace the distance below which it contains a point of unit norm: that which its errors allow. -> (N,)"""
-    return _limit(_estimate_moves(release))
+    return _limit(_measure_errors(release).moves)
 
 
-def _estimate_moves(release: Subspaces) -> Doubles:
-    """Return how far errors may move the points of unit norm in each subspace. -> (N,)
+@dataclass(frozen=True, eq=False)
+class _Errors:
+    """The errors of the subspaces of a release."""
+
+    vectors: Doubles  # (N,) of unit vectors in the span of the basis (`estimate_errors`)
+    moves: Doubles  # (N,) how far these may move the points of unit norm
+
+
+def _measure_errors(release: Subspaces) -> _Errors:
+    """Estimate the errors of a release.
 
     A point o + Bᵀ c of unit norm has |c| ≤ |o| + 1. So it moves by at most e (2 |o| + 1), if e is the error of unit vectors and
     the relative error of o.
     """
-    return estimate_errors(release) * (2 * np.linalg.norm(release.origins.astype(np.float64), axis=1) + 1)
+    vectors = estimate_errors(release)
+    return _Errors(vectors, vectors * (2 * np.linalg.norm(release.origins.astype(np.float64), axis=1) + 1))
 
 
 def _limit(distances: Doubles) -> Doubles:
@@ -122,14 +133,16 @@ def estimate_errors(release: Subspaces) -> Doubles:
     return np.maximum(errors, np.median(errors)) if len(errors) else errors
 
 
-def _screen_pairs(one: Subspaces, other: Subspaces, triangle: bool = False) -> Iterator[tuple[Indices, Indices]]:
+def _screen_pairs(
+    one: Subspaces, other: Subspaces, errors: tuple[_Errors, _Errors], triangle: bool = False
+) -> Iterator[tuple[Indices, Indices]]:
     """Yield pairs that may intersect, block by block; `triangle` skips blocks where each pair has `first` > `second`."""
     import torch
 
     length = one.origins.shape[1]
     if one.dim + other.dim >= length:
         raise UserError(f"subspaces of dimensions {one.dim} and {other.dim} always intersect in a space of {length}")
-    moves = [np.square(_estimate_moves(release)) for release in (one, other)]
+    moves = [np.square(each.moves) for each in errors]
     for top, left, squares in squared_distances(one, other, one.dim + other.dim + SPARE_DIRECTIONS, triangle):
         rows, columns = (slice(start, start + count) for start, count in zip((top, left), squares.shape, strict=True))
         allowed = (NEAR + moves[0][rows, None] + moves[1][columns]).clip(max=NEAR + LARGEST_TOLERANCE**2)  # (n, n')
@@ -194,18 +207,19 @@ def _compute_squared_distances(one: Tensor, other: Tensor) -> Tensor:
     return form[b, b]
 
 
-def _decide_pairs(one: Subspaces, other: Subspaces, screened: Iterator[tuple[Indices, Indices]]) -> SubspaceIntersections:
+def _decide_pairs(
+    one: Subspaces, other: Subspaces, errors: tuple[_Errors, _Errors], screened: Iterator[tuple[Indices, Indices]]
+) -> SubspaceIntersections:
     """Return the screened pairs that intersect, decided in float64."""
     pairs = [np.empty((2, 0), dtype=np.int64), *(np.stack(pair) for pair in screened)]
     firsts, seconds = np.concatenate(pairs, axis=1)
     none = np.empty(0)
     parts = [SubspaceIntersections(firsts[:0], seconds[:0], np.empty((0, one.origins.shape[1])), none.astype(bool), none)]
-    errors, moves = ([measure(release) for release in (one, other)] for measure in (estimate_errors, _estimate_moves))
     for start in range(0, len(firsts), EXACT):
         first, second = firsts[start : start + EXACT], seconds[start : start + EXACT]
-        sines = np.hypot(errors[0][first], errors[1][second])
+        sines = np.hypot(errors[0].vectors[first], errors[1].vectors[second])
         points, distances, single = find_nearest_points(one.take(first), other.take(second), sines)
-        tolerances = _limit(np.hypot(moves[0][first], moves[1][second]))
+        tolerances = _limit(np.hypot(errors[0].moves[first], errors[1].moves[second]))
         parts.append(SubspaceIntersections(first, second, points, single, tolerances).take(distances < tolerances))
     return concatenate_intersections(parts)
 
