@@ -35,12 +35,7 @@ from defenses.privunit import PrivUnit
 
 TINY = Training(steps=4, batch=2, warmup=2)
 
-
-@pytest.fixture(autouse=True)
-def _narrow_networks(monkeypatch):
-    """Narrower embeddings than the defaults, because the optimizer spends its time on them."""
-    for name, width in {"hidden": 32, "painted": 4}.items():
-        monkeypatch.setitem(Shape.__init__.__kwdefaults__, name, width)
+pytestmark = pytest.mark.usefixtures("narrow_networks")
 
 
 @pytest.fixture(scope="module")

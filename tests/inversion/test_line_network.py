@@ -38,12 +38,7 @@ from defenses.permutation import Permutation
 NONE = np.empty(0, np.float32)
 TINY = Training(steps=4, batch=2, warmup=2)
 
-
-@pytest.fixture(autouse=True)
-def _narrow_networks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Narrower embeddings than the defaults, because the optimizer spends its time on them."""
-    for name, width in {"hidden": 32, "painted": 4}.items():
-        monkeypatch.setitem(Shape.__init__.__kwdefaults__, name, width)  # type: ignore[arg-type]
+pytestmark = pytest.mark.usefixtures("narrow_networks")
 
 
 def build_shape(length: int, samples: int = 16, widths: tuple[int, ...] = (8, 8)) -> Shape:
