@@ -16,6 +16,7 @@ from pathlib import Path
 
 from bench.cli import main as bench
 from bench.codebook.public import ASSETS
+from bench.settings import Asset
 
 WORDS = 256_000
 DICTIONARIES = (  # file, set of photographs, words, extractor
@@ -136,6 +137,15 @@ def split_photographs(data: Path, work: Path) -> dict[str, Path]:
             link.unlink(missing_ok=True)
             link.symlink_to((data / "train" / member).resolve())
     return folders
+
+
+def build_crossfit_dictionaries(folders: dict[str, Path], work: Path) -> list[Asset]:
+    """Build two dictionaries as large as the shipped one, each without the photographs of one of its thirds, once."""
+    files = {digits: work / f"dictionary-{digits}.safetensors" for digits in ("12", "02")}
+    return [
+        Asset(run_once(file, "dictionary", "build", "--images", folders[digits], "--size", WORDS))
+        for digits, file in files.items()
+    ]
 
 
 def run_once(out: Path, *words: object) -> Path:

@@ -13,16 +13,15 @@ from __future__ import annotations
 import argparse
 import itertools
 import math
-import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from make_assets import run_once, split_photographs
+from make_assets import build_crossfit_dictionaries, split_photographs
 from numpy.typing import NDArray
-from result_page import format_command, format_interval, write_page
+from result_page import format_interval, save_figure, write_page
 
 import bench
 from attacks.blank import Blank
@@ -40,7 +39,6 @@ from bench.settings import Asset
 from leaderboard.chance import IDENTIFIED, LOG_RECIPROCAL_RANK
 from leaderboard.intervals import MIN_SAMPLES, Estimate, estimate_mean
 from leaderboard.plot_style import choose_styles
-from leaderboard.provenance import CHUNK, format_provenance
 from leaderboard.signal import SIGNIFICANCE, collect_values, judge_signal
 
 if TYPE_CHECKING:
@@ -73,7 +71,6 @@ AXES = {"samples": "training samples", "photographs": "training photographs"}
 LABELS = {"ssim": ("SSIM", 3), IDENTIFIED: ("identification, bits", 2)}  # metric -> label, digits
 ZEROS = {"ssim": 0.0, IDENTIFIED: LOG_RECIPROCAL_RANK}  # metric -> value that counts as zero: a random order has no bits
 BATCH, RATE = 8, 4e-3
-WORDS = 256_000
 PICTURE = Path(__file__).parents[1] / "docs" / "images" / "curves.png"
 TENFOLD = math.log2(10)  # doublings
 
@@ -126,8 +123,7 @@ def write_results(study: Study, releases: Sequence[str], axes: Sequence[str]) ->
         for point in study.list_points(axis):
             study.train(name, point)
     curves = {key: study.measure(*key) for key in itertools.product(RELEASES, AXES) if study.is_trained(*key)}
-    provenance = format_provenance(format_command(sys.argv), study.records)
-    draw_curves(curves).savefig(PICTURE, dpi=110, metadata={CHUNK: provenance})
+    save_figure(draw_curves(curves), PICTURE, study.records)
     write_page("curves.md", format_page(curves, study), study.records)
 
 
@@ -179,18 +175,10 @@ class Study:
                 photographs=self.photographs[: point.photographs],
                 validation=self.unseen,
                 extractor=extractor,
-                crossfit=self.build_dictionaries() if defense.dictionary_field else (),
+                crossfit=build_crossfit_dictionaries(self.folders, self.work) if defense.dictionary_field else (),
                 training=build_schedule(point.samples),
             )
             train(plan, out)
-
-    def build_dictionaries(self) -> list[Asset]:
-        """Build dictionaries as large as the shipped one, each without the photographs of one third."""
-        files = {digits: self.work / f"dictionary-{digits}.safetensors" for digits in ("12", "02")}
-        return [
-            Asset(run_once(file, "dictionary", "build", "--images", self.folders[digits], "--size", WORDS))
-            for digits, file in files.items()
-        ]
 
     def attack(self, name: str, network: Path) -> dict[str, list[Record]]:
         """Return the records of the attacker and of the baselines, by attack."""

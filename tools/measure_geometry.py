@@ -13,13 +13,12 @@ Records in WORK are reused, so an interrupted run resumes.
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from result_page import RECALLS, SMALL_GALLERY, format_command, format_interval, list_values, write_page
+from result_page import RECALLS, SMALL_GALLERY, format_interval, list_values, save_figure, write_page
 
 import bench
 from bench.core.table import markdown_row
@@ -27,7 +26,6 @@ from bench.registry import discovery, spec
 from bench.runner.records import Record
 from leaderboard.intervals import interval
 from leaderboard.plot_style import choose_styles
-from leaderboard.provenance import CHUNK, format_provenance
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -90,8 +88,7 @@ def main() -> None:
     attacked = {pair: attack_positions(*pair, args.work / "attacks") for pair in pairs}
     results = (attacked, served, in_gallery, in_scene)
     records = [record for some in results for each in some.values() for record in each]
-    provenance = {CHUNK: format_provenance(format_command(sys.argv), records)}
-    draw_tradeoff(attacked, in_gallery).savefig(PICTURE, dpi=110, metadata=provenance)
+    save_figure(draw_tradeoff(attacked, in_gallery), PICTURE, records)
     parts = [
         TITLE,
         write_attacks(attacked, ON_PHOTOGRAPHS),

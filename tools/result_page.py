@@ -7,7 +7,7 @@ import shlex
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,7 +16,10 @@ from bench.core import environment
 from bench.formats.tensor_file import Arrays
 from bench.runner.records import Record
 from leaderboard.intervals import Interval
-from leaderboard.provenance import format_provenance
+from leaderboard.provenance import CHUNK, format_provenance
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
 SMALL_GALLERY = "gallery:views=40,queries=12,rooms=2"  # a dataset for localization
@@ -57,6 +60,11 @@ def write_page(name: str, text: str, configurations: Iterable[Mapping[str, Any]]
     """Write a page of docs/results/ that ends with the command of this process and the files that `configurations` refer to."""
     section = format_provenance(format_command(sys.argv), configurations)
     (RESULTS / name).write_text(f"{text.rstrip()}\n\n{section}", encoding="utf-8")
+
+
+def save_figure(figure: Figure, path: Path, configurations: Iterable[Mapping[str, Any]]) -> None:
+    """Write a picture that holds the command of this process and the files that `configurations` refer to."""
+    figure.savefig(path, dpi=110, metadata={CHUNK: format_provenance(format_command(sys.argv), configurations)})
 
 
 def format_command(argv: list[str]) -> str:

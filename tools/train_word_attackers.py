@@ -35,7 +35,7 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as nnf
-from make_assets import WORDS, run_once, split_photographs
+from make_assets import build_crossfit_dictionaries, split_photographs
 from torch import Tensor, nn
 from word_training_data import (
     Batch,
@@ -102,7 +102,7 @@ def main() -> None:
     # Variances in SSIM are differences of nearly equal numbers. With products in TF32 they are wrong, and the training fails.
     torch.set_float32_matmul_precision("highest")
     folders = split_photographs(args.data, args.work / "photographs")
-    crossfit = [build_dictionary(folders[digits], args.work / f"dictionary-{digits}.safetensors") for digits in ("12", "02")]
+    crossfit = build_crossfit_dictionaries(folders, args.work)
     unseen = collect_views(list_photographs(folders["tune"]), Sift())[::4]  # unmirrored, at 256 pixels
     sources = list_photographs(folders["012"])
     data, meta = load_data(args.work / "word-training-data.pt", sources, unseen, crossfit, pick_device())
@@ -115,11 +115,6 @@ def main() -> None:
 
 
 # ---- data
-
-
-def build_dictionary(photographs: Path, out: Path) -> Asset:
-    """Build a dictionary as large as the shipped one, unless `out` exists."""
-    return Asset(run_once(out, "dictionary", "build", "--images", photographs, "--size", WORDS))
 
 
 def load_data(
