@@ -38,7 +38,8 @@ TITLE = """# Features under the same defenses
 
 Releases of the seven built-in photographs, 256 by 256 pixels, seed 0. For each photograph, `xfeat` and `aliked` return as many
 keypoints as upright SIFT finds in it, but at least {low} and at most {high}, or all that they find if these are fewer. Oriented
-SIFT returns all that it finds. In brackets: 95% intervals of Student's t over photographs, which can exceed a metric's range.
+SIFT finds the same points as upright SIFT, and describes a point with several main orientations once for each. In brackets: 95%
+intervals of Student's t over photographs, which can exceed a metric's range.
 
 - *true word*: chance that a word set contains the descriptor's own word. It depends on ε and on the size of the dictionary:
   256,000 words for SIFT, 16,000 for the others. Equal ε are therefore no equal leakage.
@@ -55,7 +56,7 @@ EXTRACTORS = {  # -> their words; empty for the defaults of the defenses
 }
 FIELDS = {"affine": "database", "ldp": "dictionary"}  # of the words
 DEFENSES = ("none", "affine:dim=4", "ldp:epsilon=12", "ldp:epsilon=10", "ldp:epsilon=8")
-ATTACKS = ("dia", "keypoints", "blank")
+ATTACKS = ("dia", "database", "keypoints", "blank")
 LOCALIZED = ("none", "affine:dim=4", "ldp:epsilon=12", "ldp:epsilon=10")
 SHOWN = {"ssim": 3, "psnr": 2, "identified": 3}  # metric -> digits
 
@@ -91,14 +92,23 @@ def attack_features(work: Path, sources: Sequence[Source]) -> Iterator[Row]:
     limits = [count_keypoints(source) for source in sources]
     for features, defense in itertools.product(EXTRACTORS, DEFENSES):
         print(features, defense, flush=True)
-        records, reason = measure(functools.partial(run_attacks, features, defense, sources, limits, work))
-        for attack in ATTACKS:
+        attacks = list_attacks(defense)
+        records, reason = measure(functools.partial(run_attacks, features, defense, attacks, sources, limits, work))
+        for attack in attacks:
             yield build_row(features, defense, [one for one in records if one["attack"]["name"] == attack], reason, attack)
 
 
-def run_attacks(features: str, defense: str, sources: Sequence[Source], limits: Sequence[int], work: Path) -> list[Record]:
-    """Run all attacks. The extractor of each photograph has a limit of its own, so each photograph is a run."""
-    attacks = [spec.read(attack, discovery.ATTACK) for attack in ATTACKS]
+def list_attacks(defense: str) -> list[str]:
+    """Return the attacks on this kind of release."""
+    releases = spec.read(defense, discovery.DEFENSE).releases
+    return [name for name in ATTACKS if issubclass(releases, spec.read(name, discovery.ATTACK).accepts)]
+
+
+def run_attacks(
+    features: str, defense: str, names: Sequence[str], sources: Sequence[Source], limits: Sequence[int], work: Path
+) -> list[Record]:
+    """Run the attacks. The extractor of each photograph has a limit of its own, so each photograph is a run."""
+    attacks = [spec.read(name, discovery.ATTACK) for name in names]
     protection = read_defense(defense, EXTRACTORS[features])
     extractor: Any = spec.read(features, discovery.EXTRACTOR)
     records = []

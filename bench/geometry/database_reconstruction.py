@@ -40,7 +40,8 @@ def find_normalized_points(points: Doubles, tolerances: Doubles) -> Floats:
     if len(words) == 0:
         return np.empty((0, points.shape[1]), dtype=np.float32)
     pairs = KDTree(words).query_pairs(max(UNIT_TOLERANCE, float(np.median(tolerances[normal]))), output_type="ndarray")  # (M, 2)
-    equal = coo_array((np.ones(len(pairs), bool), pairs.T), shape=(len(words), len(words)))
+    indices = pairs.T.astype(np.int32)  # the only type that connected_components of scipy 1.11 reads
+    equal = coo_array((np.ones(len(pairs), bool), indices), shape=(len(words), len(words)))
     return unit_rows(words[np.unique(connected_components(equal, directed=False)[1], return_index=True)[1]].astype(np.float32))
 
 

@@ -7,7 +7,7 @@ import measure_features
 import pytest
 import result_page
 from fakes import write_album
-from measure_features import build_row, list_reasons, measure, read_defense
+from measure_features import build_row, list_attacks, list_reasons, measure, read_defense
 from result_page import RECALLS
 
 from bench.cache import store
@@ -64,6 +64,11 @@ def test_each_defense_uses_the_words_of_the_features() -> None:
     assert read_defense("ldp:epsilon=12", "shipped-xfeat") == LDP(epsilon=12.0, dictionary="shipped-xfeat")
     assert read_defense("affine", "shipped-xfeat") == Affine(database="shipped-xfeat")
     assert read_defense("affine", "") == Affine()
+
+
+def test_each_defense_has_the_attacks_on_its_kind_of_release() -> None:
+    assert list_attacks("affine:dim=4") == ["dia", "database", "keypoints", "blank"]
+    assert list_attacks("none") == list_attacks("ldp") == ["dia", "keypoints", "blank"]
 
 
 def test_reasons() -> None:
