@@ -16,13 +16,15 @@ from bench.core.device import pick_device
 from bench.types import Indices, Words
 
 if TYPE_CHECKING:
+    import torch
     from torch import Tensor
 
 Doubles = NDArray[np.float64]
 
-BLOCK = 2048  # words in a block
-BATCH = 512  # words per query batch
-CACHE_LIMIT = 2**26  # greatest size of a cached table of levels
+BLOCK = 8192  # words in a block, so that 16-bit integers hold their counts
+BATCH = 128  # words per query batch
+CACHE_LIMIT = 2**29  # greatest size of a cached table of levels
+CELLS = 1024  # intervals of cosines from 0 to 1, in which levels are looked up
 
 
 class Neighbours:
@@ -35,7 +37,8 @@ class Neighbours:
         self._words = exact.to(pick_device())  # (K, D)
         self._lengths = exact.double().square().sum(dim=1).sqrt().to(pick_device())  # (K,)
         self._nearest: dict[int, Indices] = {}  # count -> (K, count), -1 where not computed yet
-        self._levels: dict[bytes, NDArray[np.int32]] = {}  # borders -> (K, blocks, L + 1), -1 where not computed yet
+        # borders -> (K, blocks, L + 1) and whether it is computed (K,). Only rows that are computed take memory.
+        self._levels: dict[bytes, tuple[NDArray[np.int16], NDArray[np.bool_]]] = {}
 
     def find_nearest(self, words: Indices, count: int) -> Indices:
         """Return each word and its count − 1 nearest by cosine, ties to the lowest index. (n,) -> (n, count), ascending
@@ -99,20 +102,25 @@ class Neighbours:
         """
         shape = (len(self._words), len(self._starts()), len(borders) + 1)
         if np.prod(shape) > CACHE_LIMIT:
-            return self._find_levels(words, borders)
-        table = self._levels.setdefault(borders.tobytes(), np.full(shape, -1, dtype=np.int32))
-        missing = np.unique(words[table[words, 0, 0] < 0])
+            return self._find_levels(words, borders).astype(np.int64)
+        if borders.tobytes() not in self._levels:
+            self._levels[borders.tobytes()] = np.zeros(shape, np.int16), np.zeros(len(self._words), bool)
+        table, known = self._levels[borders.tobytes()]
+        missing = np.unique(words[~known[words]])
         table[missing] = self._find_levels(missing, borders)
+        known[missing] = True
         return table[words].astype(np.int64)
 
-    def _find_levels(self, words: Indices, borders: Doubles) -> Indices:
+    def _find_levels(self, words: Indices, borders: Doubles) -> NDArray[np.int16]:
         import torch
 
-        found = np.empty((len(words), len(self._starts()), len(borders) + 1), dtype=np.int64)
+        found = np.empty((len(words), len(self._starts()), len(borders) + 1), dtype=np.int16)
+        levels = _Levels(borders, self._words.device)
         for start in range(0, len(words), BATCH):
             rows = torch.from_numpy(words[start : start + BATCH])
             for number, at in enumerate(self._starts()):
-                found[start : start + BATCH, number] = _count_per_row(self._compute_levels(rows, at, borders), len(borders) + 1)
+                counts = levels.find(self._compute_cosines(rows, at)).cpu()
+                found[start : start + BATCH, number] = _count_per_row(counts, len(borders) + 1)
         return found
 
     def select_words(self, words: Indices, borders: Doubles, counts: Indices, levels: Indices, ranks: Indices) -> Indices:
@@ -134,21 +142,41 @@ class Neighbours:
         before = np.take_along_axis(counts, levels[:, None, None], axis=2)[..., 0].cumsum(axis=1)  # (n, blocks)
         blocks = (before <= ranks[:, None]).sum(axis=1)
         rest = ranks - np.where(blocks > 0, np.take_along_axis(before, np.maximum(blocks - 1, 0)[:, None], axis=1)[:, 0], 0)
-        found = np.empty(len(words), dtype=np.int64)
+        found, level_of = np.empty(len(words), dtype=np.int64), _Levels(borders, self._words.device)
         for number in np.unique(blocks):
             rows = np.flatnonzero(blocks == number)
             start = int(number) * BLOCK
-            same = self._compute_levels(torch.from_numpy(words[rows]), start, borders) == torch.from_numpy(levels[rows])[:, None]
+            computed = level_of.find(self._compute_cosines(torch.from_numpy(words[rows]), start)).cpu()
+            same = computed == torch.from_numpy(levels[rows])[:, None]
             found[rows] = start + (same.cumsum(dim=1) > torch.from_numpy(rest[rows])[:, None]).int().argmax(dim=1).numpy()
         return found
 
-    def _compute_levels(self, rows: Tensor, start: int, borders: Doubles) -> Tensor:
-        """Compute the number of borders that each word of a block reaches. -> (n, b)"""
+
+class _Levels:
+    """The number of borders that a cosine reaches, by table for each interval of cosines without a border.
+
+    `torch.bucketize` of all cosines takes three times as long.
+    """
+
+    def __init__(self, borders: Doubles, device: torch.device) -> None:
         import torch
 
-        return torch.bucketize(
-            self._compute_cosines(rows, start), torch.from_numpy(borders).to(self._words.device), right=True
-        ).cpu()
+        self._borders = torch.from_numpy(borders).to(device)
+        # The ends of intervals are exact, and so is a cosine times CELLS. The last interval starts at 1.
+        ends = torch.arange(-CELLS, CELLS + 2, dtype=torch.float64, device=device) / CELLS
+        reached = torch.bucketize(ends[:-1], self._borders, right=True)
+        within = torch.bucketize(ends[1:], self._borders)  # borders below the end
+        self._table = torch.where(reached == within, reached, -1)
+
+    def find(self, cosines: Tensor) -> Tensor:
+        """Return the levels of cosines from -1 to slightly more than 1. (n, b) -> (n, b)"""
+        import torch
+
+        intervals = (cosines * CELLS).floor_().clamp_(-CELLS, CELLS).to(torch.int32).add_(CELLS)
+        levels = self._table.index_select(0, intervals.ravel()).view(cosines.shape)
+        mixed = (levels < 0).nonzero(as_tuple=True)
+        levels[mixed] = torch.bucketize(cosines[mixed], self._borders, right=True)
+        return levels
 
 
 def _count_per_row(levels: Tensor, count: int) -> Indices:

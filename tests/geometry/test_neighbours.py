@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch
 
 from bench.codebook.examples import draw_features
 from bench.geometry import neighbours
@@ -43,7 +44,7 @@ def test_nearest_against_sorting(count: int) -> None:
 
 
 def test_levels_and_words_by_rank() -> None:
-    codes, borders = words(), np.array([0.2, 0.4, 0.5, 1 - 1e-9])
+    codes, borders = words(), np.array([0.2, 0.4, 0.5, 1 - 1e-9])  # 0.5 is an end of an interval of `_Levels`
     levels = (cosines(codes)[:, :, None] >= borders).sum(axis=2)  # (K, K)
     near, queries = Neighbours(codes), np.random.default_rng(1).integers(300, size=120)
     counts = near.count_levels(queries, borders)
@@ -56,6 +57,16 @@ def test_levels_and_words_by_rank() -> None:
         found = near.select_words(queries[rows], borders, counts[rows], np.full(len(rows), level), ranks)
         for row, rank, word in zip(rows, ranks, found, strict=True):
             assert np.flatnonzero(levels[queries[row]] == level)[rank] == word
+
+
+@pytest.mark.parametrize("cells", [4, 1024])
+def test_levels_by_table_are_those_of_comparisons(monkeypatch: pytest.MonkeyPatch, cells: int) -> None:
+    monkeypatch.setattr(neighbours, "CELLS", cells)
+    borders = np.array([-0.75, -1e-9, 0.0, 0.25, 0.3, 0.3 + 1e-15, 1 - 1e-9])
+    edges = np.concatenate([borders, np.linspace(-1, 1, 9), [1 + 1e-12]])
+    cosines = np.concatenate([edges, np.nextafter(edges, -2), np.nextafter(edges, 2), np.random.default_rng(0).uniform(-1, 1, 500)])
+    levels = neighbours._Levels(borders, torch.device("cpu")).find(torch.from_numpy(cosines)[None])
+    np.testing.assert_array_equal(levels[0].numpy(), (cosines[:, None] >= borders).sum(axis=1))
 
 
 def test_results_do_not_depend_on_the_batch(monkeypatch: pytest.MonkeyPatch) -> None:
