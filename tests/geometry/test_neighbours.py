@@ -64,7 +64,9 @@ def test_levels_by_table_are_those_of_comparisons(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(neighbours, "CELLS", cells)
     borders = np.array([-0.75, -1e-9, 0.0, 0.25, 0.3, 0.3 + 1e-15, 1 - 1e-9])
     edges = np.concatenate([borders, np.linspace(-1, 1, 9), [1 + 1e-12]])
-    cosines = np.concatenate([edges, np.nextafter(edges, -2), np.nextafter(edges, 2), np.random.default_rng(0).uniform(-1, 1, 500)])
+    cosines = np.concatenate(
+        [edges, np.nextafter(edges, -2), np.nextafter(edges, 2), np.random.default_rng(0).uniform(-1, 1, 500)]
+    )
     levels = neighbours._Levels(borders, torch.device("cpu")).find(torch.from_numpy(cosines)[None])
     np.testing.assert_array_equal(levels[0].numpy(), (cosines[:, None] >= borders).sum(axis=1))
 
