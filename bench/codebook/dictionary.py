@@ -79,7 +79,10 @@ class Dictionary:
         UserError
             if the lengths differ, or one of the two has signs and the other the 8 bits of SIFT.
         """
-        hint = "build one with `bench dictionary build`; shipped-xfeat and shipped-aliked are such"
+        hint = (
+            "pass one for these features: shipped is for sift, shipped-xfeat for xfeat, shipped-aliked for aliked, and "
+            "`bench dictionary build` makes others"
+        )
         if rows.shape[1] != self.words.shape[1]:
             raise UserError(f"the descriptors have length {rows.shape[1]}, the words of {asset} {self.words.shape[1]}; {hint}")
         negative = np.square(np.minimum(rows, 0, dtype=np.float64)).sum()  # of learned features about half of the total

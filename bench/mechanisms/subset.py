@@ -21,7 +21,8 @@ import math
 from decimal import MAX_EMAX, MIN_EMIN, ROUND_CEILING, ROUND_FLOOR, ROUND_HALF_EVEN, Context, Decimal
 from fractions import Fraction
 from functools import lru_cache
-from itertools import count, pairwise
+from itertools import count
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +32,7 @@ from bench.types import Bytes, Indices
 
 WIDTH = 64  # bits of p compared in one step
 STEP = 2**15  # words drawn at a time, which fit into the cache
+NETWORK = 8  # greatest length of rows that are sorted by comparisons of columns
 
 
 def chance_digits(epsilon: float, domain: int, size: int, bits: int) -> int:
@@ -132,16 +134,22 @@ def draw_inclusion(rows: int, epsilon: float, domain: int, size: int, rng: np.ra
     """
     if _is_certain(epsilon, domain, size):
         return np.ones(rows, dtype=bool)
-    included = np.zeros(rows, dtype=bool)
-    undecided = np.arange(rows)
-    for bits in count(WIDTH, WIDTH):
+    included, undecided = _compare_bits(rows, epsilon, domain, size, WIDTH, rng)
+    for bits in count(2 * WIDTH, WIDTH):
         if len(undecided) == 0:
             break
-        digits = np.uint64(chance_digits(epsilon, domain, size, bits) % 2**WIDTH)
-        drawn = rng.integers(2**WIDTH - 1, size=len(undecided), dtype=np.uint64, endpoint=True)
-        included[undecided] = drawn < digits
-        undecided = undecided[drawn == digits]
+        included[undecided], equal = _compare_bits(len(undecided), epsilon, domain, size, bits, rng)
+        undecided = undecided[equal]
     return included
+
+
+def _compare_bits(
+    rows: int, epsilon: float, domain: int, size: int, bits: int, rng: np.random.Generator
+) -> tuple[NDArray[np.bool_], Indices]:
+    """Compare random numbers with the last 64 of the first `bits` of p. -> which are less (N,), the indices of equal ones"""
+    digits = np.uint64(chance_digits(epsilon, domain, size, bits) % 2**WIDTH)
+    drawn = rng.integers(2**WIDTH - 1, size=rows, dtype=np.uint64, endpoint=True)
+    return drawn < digits, np.flatnonzero(drawn == digits)
 
 
 def draw_distinct(rows: int, domain: int, size: int, rng: np.random.Generator) -> Indices:
@@ -180,29 +188,32 @@ def draw_word_subsets(true: Indices, domain: int, epsilon: float, size: int, rng
 def _draw_one_by_one(true: Indices, included: NDArray[np.bool_], domain: int, size: int, rng: np.random.Generator) -> Indices:
     """Return words other than v, drawn independently; v replaces the first if u = 1. (N,), (N,) -> (N, m), rows ascending"""
     words = np.empty((len(true), size), dtype=np.int64)
+    dtype = np.int32 if domain < 2**31 else np.int64  # the random numbers are the same
     step = max(1, STEP // size)
     for start in range(0, len(true), step):
         rows = slice(start, start + step)
-        drawn = rng.integers(domain - 1, size=(size, len(true[rows])))  # (m, n) of the remaining |K| − 1
-        drawn += drawn >= true[rows]
-        np.copyto(drawn[0], true[rows], where=included[rows])
+        own: NDArray[Any] = true[rows].astype(dtype)
+        drawn = rng.integers(domain - 1, size=(size, len(own)), dtype=dtype)  # (m, n) of the remaining |K| − 1
+        drawn += drawn >= own
+        drawn[0] += (own - drawn[0]) * included[rows]  # half the time of a masked copy
         _sort_rows(drawn, words[rows])
     return words
 
 
-def _sort_rows(columns: Indices, rows: Indices) -> None:
+def _sort_rows(columns: NDArray[Any], rows: Indices) -> None:
     """Write the sorted rows of a matrix that is given by its columns, which are overwritten. (m, n), (n, m)"""
-    if len(columns) > 4:
+    if len(columns) > NETWORK:
         rows[:] = columns.T
         rows.sort(axis=1)
         return
-    for last in range(len(columns) - 1, 0, -1):  # bubble sort: for such short rows, np.sort takes up to ten times as long
-        for low, high in pairwise(columns[: last + 1]):
-            least = np.minimum(low, high)
-            np.maximum(low, high, out=high)
-            low[:] = least
-        rows[:, last] = columns[last]
-    rows[:, 0] = columns[0]
+    sorted_columns = list(columns)
+    for last in range(len(columns) - 1, 0, -1):  # bubble sort of whole columns, which np.sort of short rows cannot vectorize
+        for low in range(last):
+            least = np.minimum(sorted_columns[low], sorted_columns[low + 1])
+            np.maximum(sorted_columns[low], sorted_columns[low + 1], out=sorted_columns[low + 1])
+            sorted_columns[low] = least
+    for number, column in enumerate(sorted_columns):
+        rows[:, number] = column
 
 
 def _find_repeating(rows: Indices) -> Indices:
