@@ -40,12 +40,11 @@ Each defense beside Gaussian noise on raw descriptors with the same matching sco
 ADAPTED = "`dia` reads the noise with a network that was trained for it."
 UNADAPTED = (
     "No network was trained for noise. The attacks on it are `denoise`, which estimates descriptors for the network for raw "
-    "ones, and the baselines. An adapted network may find more. So *leaks less than noise* stays true with it, and *leaks more* "
-    "may not."
+    "ones, and the baselines. An adapted network may find more. So no defense has the flag *leaks more than noise* here."
 )
 SCORE = "recall"  # of the task `matching`
 LARGEST = 4.0  # sigma; at it hardly any descriptor finds its match
-EVALUATIONS = 8  # of the matching score, for each defense
+EVALUATIONS = 10  # of the matching score, for each defense
 DENOISE = tuple(f"denoise:estimate={estimate}" for estimate in ("released", "word", "mean"))
 
 
@@ -100,8 +99,11 @@ def main() -> None:
 
 def measure(
     texts: Sequence[str], attacks: Sequence[str], images: Path | None, extractor: Extractor, each: int, work: Path
-) -> tuple[dict[str, Match], list[Record]]:
-    """Return the noise of each defense, and the records of the attacks on both and of their utility."""
+) -> tuple[dict[str, Match | str], list[Record]]:
+    """Return the noise of each defense, and the records of the attacks on both and of their utility.
+
+    A defense without a matching score has the reason instead.
+    """
     utilities: list[Record] = []
 
     def match(defense: Defense) -> Utility:
@@ -109,12 +111,18 @@ def measure(
         utilities.extend(records)
         return average_utility(records)
 
-    matches: dict[str, Match] = {}
+    matches: dict[str, Match | str] = {}
     defenses = [spec.read(text, discovery.DEFENSE) for text in texts]
     for text, defense in zip(texts, defenses, strict=True):
-        found = matches[text] = find_sigma(match(defense), lambda sigma: match(Noise(sigma=sigma)))
+        try:
+            target = match(defense)
+        except UserError as error:  # such as hidden positions
+            matches[text] = str(error)
+            continue
+        found = matches[text] = find_sigma(target, lambda sigma: match(Noise(sigma=sigma)))
         print(f"{text}: {SCORE} {found.target.score:.4f}, sigma {found.sigma:g}: {found.noise.score:.4f}", flush=True)
-    noises = [Noise(sigma=sigma) for sigma in dict.fromkeys(found.sigma for found in matches.values() if found.is_close)]
+    close = [found.sigma for found in matches.values() if isinstance(found, Match) and found.is_close]
+    noises = [Noise(sigma=sigma) for sigma in dict.fromkeys(close)]
     attackers = attack_suite.read_attacks(attacks)
     return matches, [*bench.run([*defenses, *noises], attackers, images, extractor=extractor, out=work / "attacks"), *utilities]
 
@@ -149,7 +157,7 @@ def find_sigma(target: Utility, match: Callable[[float], Utility]) -> Match:
     return min(matches, key=lambda one: one.difference)
 
 
-def format_page(matches: Mapping[str, Match], records: Sequence[Record], adapted: bool) -> str:
+def format_page(matches: Mapping[str, Match | str], records: Sequence[Record], adapted: bool) -> str:
     """Return the page: the noise of each defense, and the worst cases by the measures that rank defenses."""
     groups = build_groups([LocatedRecord(record, Path()) for record in records])
     tables = [table for group in groups if group.has_attacks and (table := build_suite_table(group, groups, brief=True))]
@@ -157,11 +165,14 @@ def format_page(matches: Mapping[str, Match], records: Sequence[Record], adapted
     return "\n".join([title, *format_matches(matches), "", *(to_markdown(table) for table in tables)])
 
 
-def format_matches(matches: Mapping[str, Match]) -> Iterator[str]:
+def format_matches(matches: Mapping[str, Match | str]) -> Iterator[str]:
     """Yield the table of the noise of each defense. Without noise of equal score it states the nearest one."""
     yield markdown_row(("defense", "matching score", "precision", "sigma", "matching score of the noise", "its precision"))
     yield markdown_row(["---"] * 6)
     for text, match in matches.items():
+        if isinstance(match, str):
+            yield markdown_row((f"`{text}`", f"n/a: {match}", "", "", "", ""))
+            continue
         sigma = f"{match.sigma:g}" if match.is_close else f"n/a: nearest is {match.sigma:g}"
         numbers = (f"{value:.3f}" for each in (match.target, match.noise) for value in (each.score, each.precision))
         score, precision, *others = numbers

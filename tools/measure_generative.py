@@ -1,14 +1,17 @@
 """Evaluates the attack `generative` beside `dia`, and writes docs/results/generative.md.
 
-    python tools/measure_generative.py --data DATA --weights W.safetensors --defense none --defense ldp:epsilon=10
+    python tools/measure_generative.py --data DATA --training TRAINING --defense none --defense ldp:epsilon=10
 
-DATA is the folder of `train/`, `tune.txt` and `test.txt`. The photographs of `test.txt` are reconstructed. The network has to be
-trained on photographs of `train/` that neither list names. Results are cached for each photograph, so an interrupted run resumes.
+DATA is the folder of `train/`, `tune.txt` and `test.txt`. The photographs of one of the lists are reconstructed. Choose settings
+with `--list tune`. TRAINING is the folder of the network's training photographs. Results are cached for each photograph, so an
+interrupted run resumes.
 
 1. Of `--samples` samples of each photograph: their mean score, the best score, and the score of their mean.
-2. The spread between the samples, and the fraction of the prior's variance that the release determines.
-3. The same for samples of the prior, which do not read the release.
-4. The similarity of samples of the prior to the nearest training photograph.
+2. The differences of these scores between the mean image and a sample, and between a sample and `dia`.
+3. The spread between the samples, and the fraction of the prior's variance that the release determines.
+4. The same for samples of the prior, which do not read the release.
+5. The similarity of samples of the prior to the nearest training photograph.
+6. A picture of samples of built-in photographs.
 
 The best of several samples is chosen with the photograph itself, so it is a reference and not an attack.
 """
@@ -20,19 +23,18 @@ import dataclasses
 import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from measure_identity import build_table
-from result_page import cache_arrays, format_interval, write_page
+from result_page import cache_arrays, format_interval, save_figure, write_page
 
 from attacks.dia import DIA
 from attacks.generative import Generative
-from bench.api import Attack, Defense, Metric
+from bench.api import Defense, Metric
 from bench.core.progress import Progress
 from bench.extractors.sift import Sift
 from bench.formats.tensor_file import Arrays
-from bench.identification.distractors import DUPLICATE
 from bench.identification.thumbnails import SIDE, Doubles, compute_thumbnail, normalize_thumbnails
 from bench.images import photographs
 from bench.images.photographs import Source, crop_square, decode
@@ -48,9 +50,12 @@ from metrics.identified import Identified
 from metrics.psnr import PSNR
 from metrics.ssim import SSIM
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 TEXT = """# Samples of the generative attack
 
-{count} photographs of `test.txt`, upright SIFT features, seed 0. `generative` draws {samples} samples of each photograph with
+{count} photographs of `{list}.txt`, upright SIFT features, seed 0. `generative` draws {samples} samples of each photograph with
 {steps} steps and guidance {guidance:g}. `prior` draws them with guidance 0, which does not read the release.
 
 - *a sample*: the mean score of the samples.
@@ -65,6 +70,12 @@ In brackets: 95% intervals over photographs.
 
 {scores}
 
+## Differences
+
+Means of differences, paired by photograph. Positive: the first has the higher number, which is not always the better one.
+
+{differences}
+
 ## Diversity
 
 *spread*: standard deviation between the samples, the mean over pixels and channels of range 1. *determined*: fraction of the
@@ -75,13 +86,24 @@ for thumbnails of 16 x 16 pixels.
 
 ## Memorisation
 
-Similarity of thumbnails to the nearest of {thumbnails:,} crops of {training:,} training photographs, in all eight symmetries.
-Copies of training photographs are nearer than photographs that the network has never seen. The control has random crops of
-training photographs, which the check has to find.
+Similarity of thumbnails to the nearest of {thumbnails:,} crops of the {training:,} training photographs, in all eight symmetries.
+The control has random crops of training photographs, and 95% of them are at least as similar as {threshold:.3f}. The other
+photographs, which the network has never seen, show how often that happens without copying.
 
 {memorisation}
+
+## Pictures
+
+From left to right: the photograph, `dia`, two samples, the mean of {samples} samples, and two samples of the prior. Each row has
+another defense: {labels}.
+
+![Samples of built-in photographs](../images/generative.png)
 """
-CROPS = (0, 16, 32, 48, 64)  # pixels: offsets of crops of 256 pixels in a view of 320
+PICTURE = Path(__file__).parents[1] / "docs" / "images" / "generative.png"
+PICTURED = 3  # built-in photographs
+CROPS = range(0, 65, 8)  # pixels: offsets of crops of 256 pixels in a view of 320
+CONTROL = "control: crops of training photographs"
+FOUND = 0.95  # fraction of the control that the check for copies finds
 VIEW = photographs.SIDE + CROPS[-1]
 
 
@@ -167,6 +189,23 @@ def list_scores(label: str, arrays: Arrays, metrics: Sequence[Metric]) -> Iterat
         yield [label, kind if len(kinds) > 1 else "", *(summarize(metric, get(metric)) for metric in metrics)]
 
 
+def list_differences(label: str, arrays: Arrays, dia: Arrays, metrics: Sequence[Metric]) -> Iterator[list[str]]:
+    """Yield the rows of one attack: the mean image minus a sample, and a sample minus `dia`."""
+    for kind in ("mean image - a sample", "a sample - `dia`"):
+        row = [label, kind]
+        for metric in metrics:
+            sample = arrays[metric.name()].mean(axis=1)
+            pair = (
+                (arrays[f"{metric.name()} of mean"][:, 0], sample)
+                if kind.startswith("mean")
+                else (sample, dia[metric.name()][:, 0])
+            )
+            difference = pair[0] - pair[1]
+            present = difference[~np.isnan(difference)]
+            row.append(format_interval(interval(present), 3) if len(present) else "n/a")
+        yield row
+
+
 def list_diversity(label: str, arrays: Arrays, prior: Arrays) -> list[str]:
     """Return the row of one attack: spread, and the determined fractions of pixels and of the layout."""
     determined = [1 - arrays[name].mean() / prior[name].mean() for name in ("variance", "layout")]
@@ -208,18 +247,18 @@ def collect_thumbnails(sources: Sequence[Source]) -> Doubles:
 
 
 def find_nearest(thumbnails: Doubles, training: Doubles) -> Doubles:
-    """Return the greatest similarity of each thumbnail to a training thumbnail, over all symmetries. (n, 16, 16) -> (n,)"""
+    """Return the greatest similarity of each thumbnail to a training thumbnail, over all symmetries. (..., 16, 16) -> (n,)"""
     known = normalize_thumbnails(training)
+    thumbnails = thumbnails.reshape(-1, SIDE, SIDE)
     symmetric = [np.rot90(each, turns, (1, 2)) for each in (thumbnails, thumbnails[:, :, ::-1]) for turns in range(4)]
     return np.max([(normalize_thumbnails(each) @ known.T).max(axis=1) for each in symmetric], axis=0)
 
 
-def list_memorisation(sets: Mapping[str, Doubles], training: Doubles) -> Iterator[list[str]]:
-    """Yield a row for each set of thumbnails: their number, quantiles of the similarity, and the number of copies."""
-    for label, thumbnails in sets.items():
-        nearest = find_nearest(thumbnails.reshape(-1, SIDE, SIDE), training)
-        quantiles = (f"{value:.3f}" for value in np.quantile(nearest, (0.5, 0.95, 1.0)))
-        yield [label, str(len(nearest)), *quantiles, str(int((nearest >= DUPLICATE).sum()))]
+def list_memorisation(sets: Mapping[str, Doubles], threshold: float) -> Iterator[list[str]]:
+    """Yield a row for each set of similarities: their number, quantiles, and the fraction that reaches the threshold."""
+    for label, nearest in sets.items():
+        quantiles = (f"{value:.3f}" for value in np.quantile(nearest, (0.5, 0.95)))
+        yield [label, str(len(nearest)), *quantiles, f"{(nearest >= threshold).mean():.3f}"]
 
 
 # ---- the page
@@ -228,70 +267,122 @@ def list_memorisation(sets: Mapping[str, Doubles], training: Doubles) -> Iterato
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True, help="the folder of train/, tune.txt and test.txt")
-    parser.add_argument("--weights", required=True, help="the network of `bench train --model flow`")
+    parser.add_argument("--training", type=Path, required=True, help="folder of the photographs that the network was trained on")
+    parser.add_argument("--weights", default="shipped", help="a network of `bench train --model flow` (default: %(default)s)")
+    parser.add_argument("--list", choices=("tune", "test"), default="test", help="of photographs (default: %(default)s)")
     parser.add_argument("--defense", action="append", required=True, help="may be repeated; the network serves the first")
-    parser.add_argument("--photographs", type=int, default=100, help="of test.txt (default: %(default)s)")
+    parser.add_argument("--photographs", type=int, default=100, help="of the list (default: %(default)s)")
     parser.add_argument("--samples", type=int, default=8, help="of each photograph (default: %(default)s)")
     parser.add_argument("--steps", type=int, default=Generative.steps, help="of the solver (default: %(default)s)")
     parser.add_argument("--guidance", type=float, default=Generative.guidance, help="(default: %(default)s)")
     args = parser.parse_args()
     if args.samples < 2:
         parser.error("--samples must be at least 2")
-    listed = {name: (args.data / f"{name}.txt").read_text().split() for name in ("tune", "test")}
     named = {source.name: source for source in photographs.list_photographs(args.data / "train")}
-    tested = [named[name] for name in listed["test"][: args.photographs]]
-    training = [source for name, source in named.items() if name not in {*listed["tune"], *listed["test"]}]
+    tested = [named[name] for name in (args.data / f"{args.list}.txt").read_text().split()[: args.photographs]]
+    training = photographs.list_photographs(args.training)
     attack = Generative(weights=Asset(args.weights), samples=args.samples, steps=args.steps, guidance=args.guidance)
     defenses = {spec.read(each, discovery.DEFENSE): each for each in args.defense}
-    text, configurations = evaluate(defenses, attack, tested, training)
+    text, configurations = evaluate(defenses, attack, tested, training, args.list)
+    save_figure(draw_samples(list(defenses), attack, photographs.list_builtin()[:PICTURED]), PICTURE, configurations)
     write_page("generative.md", text, configurations)
 
 
+def plan_attacks(defenses: Sequence[Defense], attack: Generative, images: Sequence[Source]) -> Plan:
+    """Return the plan of the prior on the first defense, and of the attack and `dia` on each."""
+    task, attacks = Reconstruction(), (DIA(), attack)
+    pairs = ((defenses[0], dataclasses.replace(attack, guidance=0.0)), *cross(task, defenses, attacks))
+    return build_plan(RunConfiguration(pairs=pairs, images=list(images), task=task, extractor=Sift(), dataset=None, seed=0))
+
+
+def draw_samples(defenses: Sequence[Defense], attack: Generative, sources: Sequence[Source]) -> Figure:
+    """Draw, for each defense and photograph: the photograph, `dia`, two samples, their mean, and two samples of the prior."""
+    from matplotlib.figure import Figure
+
+    plan = plan_attacks(defenses, attack, sources)
+    rows: dict[tuple[Defense, int], list[Floats]] = {}
+    for number, sample in enumerate(plan.samples):
+        prior: list[Floats] = []
+        for experiment in plan.experiments:
+            if experiment.reason is not None:
+                continue
+            trial = TrialRunner(plan).build_trial(experiment, sample)
+            row = rows.setdefault((experiment.defense, number), [(trial.pixels() / 255).astype(np.float32)])
+            if isinstance(experiment.attack, DIA):
+                row.append(experiment.attack.reconstruct(build_view(trial), trial.rng))
+                continue
+            assert isinstance(experiment.attack, Generative)
+            images = experiment.attack.sample(build_view(trial), trial.rng)
+            if experiment.attack.guidance == 0:
+                prior = list(images[:2])
+            else:
+                row += [*images[:2], images.mean(axis=0), *prior]
+    ordered = [rows[defense, number] for number in range(len(plan.samples)) for defense in defenses if (defense, number) in rows]
+    figure = Figure(figsize=(2 * max(map(len, ordered)), 2 * len(ordered)), layout="constrained")
+    for axes, row in zip(figure.subplots(len(ordered), max(map(len, ordered)), squeeze=False), ordered, strict=True):
+        for axis in axes:
+            axis.axis("off")
+        for axis, image in zip(axes, row, strict=False):
+            axis.imshow(image.clip(0, 1))
+    return figure
+
+
 def evaluate(
-    defenses: Mapping[Defense, str], attack: Generative, tested: Sequence[Source], training: Sequence[Source]
+    defenses: Mapping[Defense, str], attack: Generative, tested: Sequence[Source], training: Sequence[Source], name: str
 ) -> tuple[str, list[Any]]:
-    """Return the page without its provenance, and the configurations of the plugins. `defenses` have their labels."""
-    task, prior, metrics = Reconstruction(), dataclasses.replace(attack, guidance=0.0), list_metrics()
-    attacks: list[Attack] = [attack, DIA()]
-    pairs = ((next(iter(defenses)), prior), *cross(task, list(defenses), attacks))
-    plan = build_plan(RunConfiguration(pairs=pairs, images=list(tested), task=task, extractor=Sift(), dataset=None, seed=0))
-    scores, diversity, first = [], [], None
+    """Return the page without its provenance, and the configurations of the plugins. `defenses` have their labels.
+
+    `name` is that of the list of photographs.
+    """
+    metrics, plan = list_metrics(), plan_attacks(list(defenses), attack, tested)
+    scores, diversity, first, dia = [], [], None, None
+    differences: list[list[str]] = []
     with Progress("samples", len(plan.experiments) * len(plan.samples)) as progress:
         for experiment in plan.experiments:
-            name = "dia" if isinstance(experiment.attack, DIA) else attack.name()
-            label = "prior" if experiment.attack == prior else f"`{name}` on `{defenses[experiment.defense]}`"
+            assert isinstance(experiment.attack, DIA | Generative)
+            is_prior = isinstance(experiment.attack, Generative) and experiment.attack.guidance == 0
+            label = "prior" if is_prior else f"`{experiment.attack.name()}` on `{defenses[experiment.defense]}`"
             if experiment.reason is not None:
                 scores.append([label, experiment.reason, *([""] * len(metrics))])
                 continue
             arrays = measure(plan, experiment, metrics, progress)
             scores += list_scores(label, arrays, metrics)
-            if experiment.attack == prior:
-                first = arrays
-            if first is not None and isinstance(experiment.attack, Generative):
-                diversity.append(list_diversity(label, arrays, first))
+            if isinstance(experiment.attack, DIA):
+                dia = arrays
+                continue
+            first = arrays if is_prior else first
+            assert first is not None  # the prior is the first experiment, and the network reads its defense
+            diversity.append(list_diversity(label, arrays, first))
+            if dia is not None and not is_prior:
+                differences += list_differences(label, arrays, dia, metrics)
     if first is None:
-        reason = next(experiment.reason for experiment in plan.experiments if experiment.attack == prior)
-        raise SystemExit(f"generative: {reason}")
+        raise SystemExit(f"generative: {plan.experiments[0].reason}")
     known, rng = collect_thumbnails(training), np.random.default_rng(0)
-    drawn = [training[int(rng.integers(len(training)))] for _ in range(first["thumbnails"][:, 0].shape[0])]
+    drawn = [training[int(rng.integers(len(training)))] for _ in tested]
     sets = {
         "samples of the prior": first["thumbnails"],
         "other photographs": compute_thumbnails(photographs.read(source).pixels for source in tested)["thumbnails"],
-        "control: crops of training photographs": compute_thumbnails(draw_crop(source, rng) for source in drawn)["thumbnails"],
+        CONTROL: compute_thumbnails(draw_crop(source, rng) for source in drawn)["thumbnails"],
     }
+    nearest = {label: find_nearest(thumbnails, known) for label, thumbnails in sets.items()}
+    threshold = float(np.quantile(nearest[CONTROL], 1 - FOUND))
     names = [f"{metric.name()}, bits" if metric.name() == Identified.name() else metric.name() for metric in metrics]
     text = TEXT.format(
         count=len(tested),
+        list=name,
         samples=attack.samples,
         steps=attack.steps,
         guidance=attack.guidance,
         scores=build_table(["attack", "estimate", *names], scores),
+        differences=build_table(["attack", "difference", *(metric.name() for metric in metrics)], differences),
         diversity=build_table(["attack", "spread", "determined", "layout determined"], diversity),
         training=len(training),
         thumbnails=len(known),
+        threshold=threshold,
         memorisation=build_table(
-            ["thumbnails", "number", "median", "95%", "greatest", f"at least {DUPLICATE}"], list_memorisation(sets, known)
+            ["thumbnails", "number", "median", "95%", f"at least {threshold:.3f}"], list_memorisation(nearest, threshold)
         ),
+        labels=", ".join(f"`{label}`" for label in defenses.values()),
     )
     return text, [experiment.metadata[part] for experiment in plan.experiments for part in ("defense", "attack")]
 

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from bench.registry import spec
+from bench.runner import attack_suite
 from bench.runner.records import FILE, SCHEMA, experiment_id, run_hash, seal
 
 SIFT = {"name": "sift", "upright": True, "max_keypoints": 1000}
@@ -17,6 +19,10 @@ SETTINGS = {"ssim": {"sigma": 1.5}, "mae": {}}
 PHOTOGRAPHS = {"name": "photos", "hash": "sha256:" + "a" * 64, "extractor": SIFT}
 GALLERY = {"name": "gallery", "hash": "sha256:" + "b" * 64, "extractor": SIFT}
 DIA = {"name": "dia", "weights": "sha256:" + "d" * 64}
+STANDARD = "standard-2026.1"
+UNFIT = "attacks Subspaces; ldp releases WordSets"
+DIFFERENCES = np.array([-0.02, 0.01, 0.0, 0.02, -0.01, 0.0])  # between photographs
+SCORES = {"blank": 0.1, "keypoints": 0.2, "dia": 0.5, "context": 0.4, "repeat": 0.6, "oracle": 0.7}  # the others do not apply
 UNCOVERED = ["the keypoints' positions", "the number of keypoints"]
 
 
@@ -89,6 +95,25 @@ def reconstructions(defense: dict[str, Any], scores: Sequence[float], **more: An
         )
         for number, score in enumerate(scores)
     ]
+
+
+def run_suite(
+    scores: Mapping[str, float] = MappingProxyType(SCORES),
+    *,
+    epsilon: float = 10.0,
+    without: Sequence[str] = (),
+    suite: str = STANDARD,
+) -> list[dict[str, Any]]:
+    """Return the records of a suite with these mean SSIM."""
+    records = []
+    for number, attack in enumerate(attack_suite.read_attacks([suite])):
+        name, encoded = attack.name(), spec.to_json(attack)
+        if name in scores:
+            values = (scores[name] + np.roll(DIFFERENCES, number)).tolist()
+            records += reconstructions(ldp(epsilon), values, attack=encoded)
+        elif name not in without:
+            records.append(inapplicable(ldp(epsilon), encoded, f"{name} {UNFIT}"))
+    return records
 
 
 def baselines(defense: dict[str, Any], count: int, score: float = 0.002, **more: Any) -> list[dict[str, Any]]:

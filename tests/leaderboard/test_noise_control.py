@@ -6,15 +6,15 @@ from typing import Any
 import fabricated
 import numpy as np
 import pytest
-from fabricated import baselines, ldp, reconstructions, record
+from fabricated import DIA, DIFFERENCES, STANDARD, baselines, ldp, reconstructions, record, run_suite
 
-from leaderboard import comparison
+from bench.runner import attack_suite
+from leaderboard import comparison, noise_control
 from leaderboard.comparison import ComparisonGroup
 from leaderboard.noise_control import LESS, MORE, NOT_LESS, TOLERANCE, compare_with_noise
 from leaderboard.suite_table import build_suite_table
 from leaderboard.worst_case import list_results
 
-DIFFERENCES = np.array([-0.02, 0.01, 0.0, 0.02, -0.01, 0.0])  # between photographs
 NONE = {"name": "none"}
 DENOISE = {"name": "denoise", "estimate": "mean", "database": "sha256:" + "f" * 64}
 
@@ -34,8 +34,8 @@ def match(defense: dict[str, Any], score: float, **more: Any) -> dict[str, Any]:
     )
 
 
-def build(folder: Path, *parts: list[dict[str, Any]]) -> tuple[ComparisonGroup, list[ComparisonGroup]]:
-    records = [one for part in (*parts, baselines(NONE, 6)) for one in part]
+def build(folder: Path, *parts: list[dict[str, Any]], count: int = 6) -> tuple[ComparisonGroup, list[ComparisonGroup]]:
+    records = [one for part in (*parts, baselines(NONE, count)) for one in part]
     groups = comparison.build_groups(comparison.load_records(fabricated.write(folder, records)))
     return next(group for group in groups if group.has_attacks), groups
 
@@ -52,15 +52,29 @@ def judge(group: ComparisonGroup, groups: list[ComparisonGroup]) -> dict[tuple[s
     }
 
 
+def build_attacked(
+    folder: Path, score: float, *more: list[dict[str, Any]], network: bool = True, **options: Any
+) -> tuple[ComparisonGroup, list[ComparisonGroup]]:
+    """Build a whole suite on `ldp` whose strongest attack has this score, and noise of equal utility that leaks 0.4."""
+    others = {"blank": 0.0, "keypoints": 0.01, "context": 0.02, "repeat": 0.02, "oracle": 0.9}
+    return build(
+        folder,
+        run_suite({**others, "dia": score}, **options),
+        attack(noise(2.0), 0.4, 2, attack=DENOISE),
+        attack(noise(2.0), 0.3, 2, attack=DIA) if network else [],
+        [match(ldp(10.0), 0.3), match(noise(2.0), 0.31)],
+        *more,
+    )
+
+
+@pytest.fixture(autouse=True)
+def _one_version(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(attack_suite, "list_attack_suites", lambda: [STANDARD])
+
+
 @pytest.mark.parametrize(("score", "verdict"), [(0.2, LESS), (0.4, NOT_LESS), (0.6, MORE)])
 def test_verdict(tmp_path: Path, score: float, verdict: str) -> None:
-    group, groups = build(
-        tmp_path,
-        attack(ldp(10.0), score, 1),
-        attack(noise(2.0), 0.4, 2, attack=DENOISE),
-        attack(noise(2.0), 0.3, 2, attack={"name": "blank"}),
-        [match(ldp(10.0), 0.3), match(noise(2.0), 0.31)],
-    )
+    group, groups = build_attacked(tmp_path, score)
     assert judge(group, groups)["ldp", "ssim"] == verdict
     assert judge(group, groups)["ldp", "mae"] is None  # the score is shown, and not judged
     table = build_suite_table(group, groups)
@@ -69,6 +83,39 @@ def test_verdict(tmp_path: Path, score: float, verdict: str) -> None:
     assert row.values["noise"].mean == pytest.approx(0.4)  # of the strongest attack
     assert row.values["noise_verdict"] == verdict
     assert (f"{verdict} of equal utility: noise:sigma=2" in row.values["flags"]) == (verdict != LESS)
+
+
+def test_a_weak_attacker_of_the_defense_is_no_evidence(tmp_path: Path) -> None:
+    complete, groups = build_attacked(tmp_path / "complete", 0.2)
+    assert judge(complete, groups)["ldp", "ssim"] == LESS
+    at_baseline, groups = build_attacked(tmp_path / "at-baseline", 0.01)
+    assert judge(at_baseline, groups)["ldp", "ssim"] == NOT_LESS
+    incomplete, groups = build_attacked(tmp_path / "incomplete", 0.2, without=["snap"])
+    assert judge(incomplete, groups)["ldp", "ssim"] == NOT_LESS
+    stronger = attack(ldp(10.0), 0.45, 3, attack={"name": "dia", "weights": "sha256:" + "e" * 64, "extra": 1})
+    with_another, groups = build_attacked(tmp_path / "another", 0.2, stronger)  # an attack outside the suite
+    assert judge(with_another, groups)["ldp", "ssim"] == MORE
+
+
+def test_a_weak_attacker_of_the_noise_is_no_evidence(tmp_path: Path) -> None:
+    group, groups = build_attacked(tmp_path / "without-network", 0.6, network=False)
+    assert judge(group, groups)["ldp", "ssim"] == NOT_LESS
+    partial = attack(noise(2.0), 0.8, 2, attack={"name": "blank"})[:4]
+    group, groups = build_attacked(tmp_path / "partial", 0.6, partial)  # an attack with missing samples does not count
+    assert judge(group, groups)["ldp", "ssim"] == MORE
+
+
+def test_versions_of_a_suite_are_one_hypothesis(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Negative control: with a correction for each version, the verdict of an old row would change."""
+    newest = "standard-2026.2"
+    monkeypatch.setattr(attack_suite, "list_attack_suites", lambda: [STANDARD, newest])
+    group, groups = build_attacked(tmp_path, 0.2, suite=newest)
+    results = list_results(group)
+    assert len([result for result in results if result.version]) == 2
+    counts = []
+    monkeypatch.setattr(noise_control, "correct_holm", lambda values: counts.append(len(values)) or values)
+    compare_with_noise(group, groups, results)
+    assert counts == [1, 1]  # SSIM, below and above
 
 
 def test_noise_of_another_utility_is_no_control(tmp_path: Path) -> None:
@@ -100,5 +147,5 @@ def test_the_nearest_utility_is_the_control(tmp_path: Path) -> None:
 
 def test_too_few_photographs_are_not_judged(tmp_path: Path) -> None:
     few = [one for one in [*attack(ldp(10.0), 0.2, 1), *attack(noise(2.0), 0.6, 2, attack=DENOISE)] if one["sample"] < "4"]
-    group, groups = build(tmp_path, few, [match(ldp(10.0), 0.3), match(noise(2.0), 0.3)])
+    group, groups = build(tmp_path, few, [match(ldp(10.0), 0.3), match(noise(2.0), 0.3)], count=4)
     assert judge(group, groups)["ldp", "ssim"] is None

@@ -5,12 +5,11 @@ from pathlib import Path
 from typing import Any
 
 import fabricated
-import numpy as np
 import pytest
-from fabricated import inapplicable, ldp, reconstructions
+from fabricated import SCORES, STANDARD, inapplicable, ldp, reconstructions, run_suite
 
 from bench.core.table import to_csv, to_markdown
-from bench.registry import discovery, spec
+from bench.registry import discovery
 from bench.runner import attack_suite
 from bench.runner.attack_suite import AttackSuite
 from leaderboard import comparison, site
@@ -19,33 +18,12 @@ from leaderboard.comparison import ComparisonGroup
 from leaderboard.suite_table import build_run_tables, build_suite_table
 from leaderboard.worst_case import SuiteResult, list_results
 
-STANDARD = "standard-2026.1"
-UNFIT = "attacks Subspaces; ldp releases WordSets"
-DIFFERENCES = np.array([-0.02, 0.01, 0.0, 0.02, -0.01, 0.0])  # between photographs
-SCORES = {"blank": 0.1, "keypoints": 0.2, "dia": 0.5, "context": 0.4, "repeat": 0.6, "oracle": 0.7}  # the others do not apply
-
-
 NEWEST = attack_suite.list_attack_suites()[-1]
 
 
 @pytest.fixture(autouse=True)
 def _one_version(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(attack_suite, "list_attack_suites", lambda: [STANDARD])
-
-
-def run_suite(
-    scores: dict[str, float] = SCORES, *, epsilon: float = 10.0, without: Sequence[str] = (), suite: str = STANDARD
-) -> list[dict[str, Any]]:
-    """Return the records of a suite with these mean SSIM."""
-    records = []
-    for number, attack in enumerate(attack_suite.read_attacks([suite])):
-        name, encoded = attack.name(), spec.to_json(attack)
-        if name in scores:
-            values = (scores[name] + np.roll(DIFFERENCES, number)).tolist()
-            records += reconstructions(ldp(epsilon), values, attack=encoded)
-        elif name not in without:
-            records.append(inapplicable(ldp(epsilon), encoded, f"{name} {UNFIT}"))
-    return records
 
 
 def build_group(folder: Path, records: Sequence[dict[str, Any]]) -> ComparisonGroup:

@@ -8,10 +8,9 @@ import match_noise
 import pytest
 import result_page
 from fakes import write_album
-from match_noise import EVALUATIONS, LARGEST, Utility, find_sigma, measure
+from match_noise import EVALUATIONS, LARGEST, Utility, find_sigma, format_matches, measure
 
 from bench.cache import store
-from bench.core.errors import UserError
 from bench.extractors.sift import Sift
 from leaderboard.noise_control import TOLERANCE
 from leaderboard.provenance import list_stale
@@ -74,7 +73,11 @@ def test_the_page_shows_the_noise_beside_the_defense(tmp_path: Path, monkeypatch
     assert (tmp_path / "matched-noise.md").read_text(encoding="utf-8") == page  # all is reused
 
 
-def test_a_defense_that_nothing_matches_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(match_noise.bench, "run", lambda *_, **__: [{"defense": {}, "metrics": {}, "reason": "nothing matches"}])
-    with pytest.raises(UserError, match="no matching score: nothing matches"):
-        measure(["none"], ["blank"], None, Sift(), 1, tmp_path)
+def test_a_defense_without_a_matching_score_has_its_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`lines` hides positions, which the task `matching` needs."""
+    monkeypatch.setenv(store.VARIABLE, str(tmp_path / "cache"))
+    album = write_album(tmp_path / "album", 1)
+    matches, _ = measure(["lines"], ["blank"], album, Sift(), 1, tmp_path / "work")
+    (row,) = list(format_matches(matches))[2:]
+    assert row.startswith("| `lines` | n/a: ")
+    assert "matching" in row

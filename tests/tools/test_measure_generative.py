@@ -6,7 +6,7 @@ import measure_generative
 import numpy as np
 import pytest
 from fakes import write_album
-from measure_generative import collect_thumbnails, draw_crop, evaluate, find_nearest, list_crops, select_best
+from measure_generative import collect_thumbnails, draw_crop, draw_samples, evaluate, find_nearest, list_crops, select_best
 
 from attacks.generative import Generative
 from bench.api import Defense
@@ -71,12 +71,13 @@ def test_the_page_has_all_parts_and_resumes(tmp_path: Path, monkeypatch: pytest.
         out,
     )
     attack = Generative(weights=Asset(str(out)), samples=2, steps=1)
-    text, configurations = evaluate(DEFENSES, attack, tested, training)
+    text, configurations = evaluate(DEFENSES, attack, tested, training, "test")
     lines = text.splitlines()
     scores = [line for line in lines if line.startswith(("| prior", "| `generative"))]
-    assert sum("a sample" in line for line in scores) == sum("best" in line for line in scores) == 2
+    assert sum("| a sample |" in line for line in scores) == sum("best" in line for line in scores) == 2
     assert any("| `dia` on `none`" in line for line in lines)
     assert any("no adapted attacker" in line for line in lines)  # on `affine`
+    assert sum("mean image - a sample" in line for line in lines) == sum("a sample - `dia`" in line for line in lines) == 1
     prior = [line for line in scores if line.startswith("| prior")][-1]
     assert prior.rstrip(" |").endswith("0.000 | 0.000")  # the release determines nothing
     assert any(line.startswith("| control: crops of training photographs | 2 |") for line in lines)
@@ -86,4 +87,7 @@ def test_the_page_has_all_parts_and_resumes(tmp_path: Path, monkeypatch: pytest.
         raise AssertionError("measured again")
 
     monkeypatch.setattr(measure_generative, "measure_photograph", fail)
-    assert evaluate(DEFENSES, attack, tested, training)[0] == text
+    assert evaluate(DEFENSES, attack, tested, training, "test")[0] == text
+    figure = draw_samples(list(DEFENSES), attack, tested[:1])
+    drawn = [len(axis.images) for axis in figure.axes]
+    assert drawn == [1, 1, 1, 1, 1, 1, 1, 1, 1, 0, 0, 0, 0, 0]  # none, and affine without a network for samples
