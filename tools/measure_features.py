@@ -16,7 +16,7 @@ import argparse
 import dataclasses
 import functools
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,10 +36,10 @@ from leaderboard.intervals import interval
 
 TITLE = """# Features under the same defenses
 
-Releases of the seven built-in photographs, 256 by 256 pixels, seed 0. For each photograph, `xfeat` and `aliked` return as many
-keypoints as upright SIFT finds in it, but at least {low} and at most {high}, or all that they find if these are fewer. Oriented
-SIFT finds the same points as upright SIFT, and describes a point with several main orientations once for each. In brackets: 95%
-intervals of Student's t over photographs, which can exceed a metric's range.
+Releases of the {count} built-in photographs in which upright SIFT finds {low} to {high} keypoints, 256 by 256 pixels, seed 0. For
+each photograph, `xfeat` and `aliked` return as many keypoints as upright SIFT. Oriented SIFT finds the same points, and describes a
+point with several main orientations once for each, up to 1,000 descriptors. In brackets: 95% intervals of Student's t over
+photographs, which can exceed a metric's range.
 
 - *true word*: chance that a word set contains the descriptor's own word. It depends on ε and on the size of the dictionary:
   256,000 words for SIFT, 16,000 for the others. Equal ε are therefore no equal leakage.
@@ -82,18 +82,19 @@ def main() -> None:
 def write_results(work: Path, sources: Sequence[Source], dataset: str) -> None:
     """Measure what the folder lacks, and write the page."""
     work.mkdir(parents=True, exist_ok=True)
-    attacked, localized = list(attack_features(work / "attacks", sources)), list(localize(work / "localization", dataset))
-    parts = [TITLE.format(low=LIMITS[0], high=LIMITS[1]), write_attacks(attacked), write_localization(localized, dataset)]
+    low, high = LIMITS
+    counts = {source: count for source in sources if low <= (count := count_keypoints(source)) <= high}
+    attacked, localized = list(attack_features(work / "attacks", counts)), list(localize(work / "localization", dataset))
+    parts = [TITLE.format(count=len(counts), low=low, high=high), write_attacks(attacked), write_localization(localized, dataset)]
     write_page("features.md", "\n".join(parts), [record for row in (*attacked, *localized) for record in row.records])
 
 
-def attack_features(work: Path, sources: Sequence[Source]) -> Iterator[Row]:
-    """Yield the results of each attack on each defense of each extractor, over the photographs."""
-    limits = [count_keypoints(source) for source in sources]
+def attack_features(work: Path, counts: Mapping[Source, int]) -> Iterator[Row]:
+    """Yield the results of each attack on each defense of each extractor, over the photographs with their keypoints."""
     for features, defense in itertools.product(EXTRACTORS, DEFENSES):
         print(features, defense, flush=True)
         attacks = list_attacks(defense)
-        records, reason = measure(functools.partial(run_attacks, features, defense, attacks, sources, limits, work))
+        records, reason = measure(functools.partial(run_attacks, features, defense, attacks, counts, work))
         for attack in attacks:
             yield build_row(features, defense, [one for one in records if one["attack"]["name"] == attack], reason, attack)
 
@@ -104,15 +105,13 @@ def list_attacks(defense: str) -> list[str]:
     return [name for name in ATTACKS if issubclass(releases, spec.read(name, discovery.ATTACK).accepts)]
 
 
-def run_attacks(
-    features: str, defense: str, names: Sequence[str], sources: Sequence[Source], limits: Sequence[int], work: Path
-) -> list[Record]:
+def run_attacks(features: str, defense: str, names: Sequence[str], counts: Mapping[Source, int], work: Path) -> list[Record]:
     """Run the attacks. The extractor of each photograph has a limit of its own, so each photograph is a run."""
     attacks = [spec.read(name, discovery.ATTACK) for name in names]
     protection = read_defense(defense, EXTRACTORS[features])
     extractor: Any = spec.read(features, discovery.EXTRACTOR)
     records = []
-    for source, limit in zip(sources, limits, strict=True):
+    for source, limit in counts.items():
         limited = dataclasses.replace(extractor, **{LIMIT: limit}) if EXTRACTORS[features] else extractor
         records += bench.run([protection], attacks, [source], extractor=limited, out=work)
     return records
@@ -152,8 +151,8 @@ def build_row(features: str, defense: str, records: Sequence[Record], reason: st
 
 
 def count_keypoints(source: Source) -> int:
-    """Return the number of keypoints that upright SIFT finds in a photograph, within `LIMITS`."""
-    return int(np.clip(len(Sift().extract(read(source).pixels, source)), *LIMITS))
+    """Return the number of keypoints that upright SIFT finds in a photograph."""
+    return len(Sift().extract(read(source).pixels, source))
 
 
 def read_defense(text: str, words: str) -> Defense:

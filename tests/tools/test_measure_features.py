@@ -38,7 +38,10 @@ def test_the_page_resumes_and_states_reasons(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setattr(measure_features, "DEFENSES", ("none", "ldp:epsilon=10,words=1000"))
     monkeypatch.setattr(measure_features, "ATTACKS", ("dia", "keypoints"))
     monkeypatch.setattr(measure_features, "run_localization", fabricate_localization)
-    sources = list_photographs(write_album(tmp_path / "album", 1))
+    first, second = list_photographs(write_album(tmp_path / "album", 2))
+    counts = {first: 250, second: 249}  # the second has too few for the networks
+    monkeypatch.setattr(measure_features, "count_keypoints", counts.get)
+    sources = [first, second]
 
     measure_features.write_results(tmp_path / "work", sources, "gallery")
     page = (tmp_path / "features.md").read_text(encoding="utf-8")
