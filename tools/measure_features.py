@@ -37,8 +37,8 @@ from leaderboard.intervals import interval
 TITLE = """# Features under the same defenses
 
 Releases of the {count} built-in photographs in which upright SIFT finds {low} to {high} keypoints, 256 by 256 pixels, seed 0. For
-each photograph, `xfeat` and `aliked` return as many keypoints as upright SIFT. Oriented SIFT finds the same points, and describes a
-point with several main orientations once for each, up to 1,000 descriptors. In brackets: 95% intervals of Student's t over
+each photograph, `xfeat` and `aliked` return as many keypoints as upright SIFT. Oriented SIFT finds the same points, and describes
+a point with several main orientations once for each, up to 1,000 descriptors. In brackets: 95% intervals of Student's t over
 photographs, which can exceed a metric's range.
 
 - *true word*: chance that a word set contains the descriptor's own word. It depends on ε and on the size of the dictionary:
