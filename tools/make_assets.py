@@ -28,7 +28,7 @@ DICTIONARIES = (  # file, set of photographs, words, extractor
 # A dictionary for photographs that a shipped dictionary was built from; not shipped.
 CROSSFIT = ("crossfit-xfeat", "2", 16_000, "xfeat")
 SETS = ("01", "02", "12", "2", "012")  # of thirds of the photographs
-NARROW = "32,64,112,56"  # widths
+NARROW, SMALL = "32,64,112,56", "24,32,48,48"  # widths
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,6 +56,33 @@ TRAININGS = (
     Training(file="positions", defenses=("none",), steps=4500, rate=4e-3, initial=None, options=("--encoding", "positions")),
     Training(file="inversion-oriented", defenses=("none",), steps=20_800, rate=4e-3, initial=None, options=ORIENTED),
     Training(
+        file="inversion-oriented-affine",
+        defenses=("affine",),
+        steps=2000,
+        photographs="2",
+        initial="inversion-oriented",
+        widths=NARROW,
+        options=ORIENTED,
+    ),
+    Training(
+        file="inversion-oriented-ldp",
+        defenses=("ldp",),
+        steps=1600,
+        photographs="2",
+        initial="inversion-oriented",
+        widths=NARROW,
+        options=ORIENTED,
+    ),
+    Training(
+        file="positions-oriented",
+        defenses=("none",),
+        steps=1000,
+        rate=4e-3,
+        initial=None,
+        widths=SMALL,
+        options=(*ORIENTED, "--encoding", "positions"),
+    ),
+    Training(
         file="inversion-xfeat",
         defenses=("none", "ldp:dictionary=shipped-xfeat,words=0"),
         steps=2600,
@@ -76,7 +103,7 @@ TRAININGS = (
         steps=1000,
         rate=4e-3,
         initial=None,
-        widths="24,32,48,48",
+        widths=SMALL,
         options=(*LEARNED, "xfeat", "--encoding", "positions"),
     ),
     Training(

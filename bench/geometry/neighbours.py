@@ -24,6 +24,7 @@ Doubles = NDArray[np.float64]
 BLOCK = 8192  # words in a block, so that 16-bit integers hold their counts
 BATCH = 128  # words per query batch
 CACHE_LIMIT = 2**29  # greatest size of a cached table of levels
+MIN_WIDTH = 8  # nearest words that are found at least
 CELLS = 1024  # intervals of cosines from 0 to 1, in which levels are looked up
 
 
@@ -36,23 +37,27 @@ class Neighbours:
         exact = torch.from_numpy(words.astype(np.float32))
         self._words = exact.to(pick_device())  # (K, D)
         self._lengths = exact.double().square().sum(dim=1).sqrt().to(pick_device())  # (K,)
-        self._nearest: dict[int, Indices] = {}  # count -> (K, count), -1 where not computed yet
+        self._nearest: dict[int, Indices] = {}  # width -> (K, width), nearest first, -1 where not computed yet
         # borders -> (K, blocks, L + 1) and whether it is computed (K,). Only rows that are computed take memory.
         self._levels: dict[bytes, tuple[NDArray[np.int16], NDArray[np.bool_]]] = {}
 
     def find_nearest(self, words: Indices, count: int) -> Indices:
         """Return each word and its count − 1 nearest by cosine, ties to the lowest index. (n,) -> (n, count), ascending
 
-        Results are cached.
+        Results are cached, and small counts share a table.
         """
-        table = self._nearest.setdefault(count, np.full((len(self._words), count), -1, dtype=np.int64))
+        width = min(max(count, MIN_WIDTH), len(self._words))
+        if width not in self._nearest:
+            self._nearest[width] = np.full((len(self._words), width), -1, dtype=np.int64)
+        table = self._nearest[width]
         missing = np.unique(words[table[words, 0] < 0])
         for start in range(0, len(missing), BATCH):
             batch = missing[start : start + BATCH]
-            table[batch] = self._find(batch, count)
-        return table[words]
+            table[batch] = self._find(batch, width)
+        return np.sort(table[words, :count], axis=1)
 
     def _find(self, words: Indices, count: int) -> Indices:
+        """Return the nearest words of each word, nearest first. (n,) -> (n, count)"""
         import torch
 
         rows = torch.from_numpy(words)
@@ -63,7 +68,7 @@ class Neighbours:
         owners, others, cosines = (np.concatenate(part) for part in zip(*parts, strict=True))
         order = np.lexsort((others, -cosines, owners))
         first = np.searchsorted(owners[order], np.arange(len(words)))
-        return np.sort(others[order][first[:, None] + np.arange(count)], axis=1)
+        return others[order][first[:, None] + np.arange(count)]
 
     def _select_at_least(self, rows: Tensor, least: Tensor, start: int) -> tuple[Tensor, Tensor, Tensor]:
         """Select pairs of a row and a word of the block with cosine at least `least`. -> (P,), (P,), (P,)"""
