@@ -25,7 +25,7 @@ BLOCK = 8192  # words in a block, so that 16-bit integers hold their counts
 BATCH = 128  # words per query batch
 CACHE_LIMIT = 2**29  # greatest size of a cached table of levels
 MIN_WIDTH = 8  # nearest words that are found at least
-CELLS = 1024  # intervals of cosines from 0 to 1, in which levels are looked up
+INTERVALS = 1024  # intervals of cosines from 0 to 1, in which levels are looked up
 
 
 class Neighbours:
@@ -167,8 +167,8 @@ class _Levels:
         import torch
 
         self._borders = torch.from_numpy(borders).to(device)
-        # The ends of intervals are exact, and so is a cosine times CELLS. The last interval starts at 1.
-        ends = torch.arange(-CELLS, CELLS + 2, dtype=torch.float64, device=device) / CELLS
+        # The ends of intervals are exact, and so is a cosine times INTERVALS. The last interval starts at 1.
+        ends = torch.arange(-INTERVALS, INTERVALS + 2, dtype=torch.float64, device=device) / INTERVALS
         reached = torch.bucketize(ends[:-1], self._borders, right=True)
         within = torch.bucketize(ends[1:], self._borders)  # borders below the end
         self._table = torch.where(reached == within, reached, -1)
@@ -177,7 +177,7 @@ class _Levels:
         """Return the levels of cosines from -1 to slightly more than 1. (n, b) -> (n, b)"""
         import torch
 
-        intervals = (cosines * CELLS).floor_().clamp_(-CELLS, CELLS).to(torch.int32).add_(CELLS)
+        intervals = (cosines * INTERVALS).floor_().clamp_(-INTERVALS, INTERVALS).to(torch.int32).add_(INTERVALS)
         levels = self._table.index_select(0, intervals.ravel()).view(cosines.shape)
         mixed = (levels < 0).nonzero(as_tuple=True)
         levels[mixed] = torch.bucketize(cosines[mixed], self._borders, right=True)

@@ -59,9 +59,9 @@ def test_levels_and_words_by_rank() -> None:
             assert np.flatnonzero(levels[queries[row]] == level)[rank] == word
 
 
-@pytest.mark.parametrize("cells", [4, 1024])
-def test_levels_by_table_are_those_of_comparisons(monkeypatch: pytest.MonkeyPatch, cells: int) -> None:
-    monkeypatch.setattr(neighbours, "CELLS", cells)
+@pytest.mark.parametrize("intervals", [4, 1024])
+def test_levels_by_table_are_those_of_comparisons(monkeypatch: pytest.MonkeyPatch, intervals: int) -> None:
+    monkeypatch.setattr(neighbours, "INTERVALS", intervals)
     borders = np.array([-0.75, -1e-9, 0.0, 0.25, 0.3, 0.3 + 1e-15, 1 - 1e-9])
     edges = np.concatenate([borders, np.linspace(-1, 1, 9), [1 + 1e-12]])
     cosines = np.concatenate(
