@@ -215,12 +215,16 @@ def test_dictionary_network_and_run(spec: str, tmp_path: Path, capsys: pytest.Ca
         sizes = ("--steps", "1", "--batch", "1", "--widths", "8,8", "--validation", str(tmp_path / "unseen"))
         run("train", "--defense", defense, "--images", folder, "--out", out, *sizes)
         attacks += ["--attack", f"dia:weights={out}"]
-    attacks += ["--attack", "lattice", "--attack", "sparsity", "--attack", "database"]
+    attacks += ["--attack", "lattice", "--attack", "sparsity", "--attack", "database", "--attack", "repeat"]
     given = [part for defense in (*defenses.values(), f"ldp:dictionary={words}") for part in ("--defense", defense)]
     task = f"reconstruction:inverter=dia:weights={tmp_path / 'none.safetensors'}"
     run("run", "--images", str(tmp_path / "photos"), "--task", task, *given, *attacks, "--out", str(tmp_path / "run"))
     records = load_records(tmp_path / "run").set_index(["defense.name", "attack.name"]).sort_index()
-    assert set(records.index[records["status"] == "ok"]) == {("none", "dia"), ("affine", "dia"), ("affine", "database")}
+    applied = {("none", "dia"), ("affine", "dia"), ("affine", "database"), ("affine", "repeat"), ("ldp", "repeat")}
+    assert set(records.index[records["status"] == "ok"]) == applied
+    recovered = records["metrics.recovered"]
+    assert recovered["affine", "repeat"] == 1.0
+    assert recovered["affine", "database"] < 1.0  # negative control: one release does not determine the descriptors
     assert "does not declare 8-bit descriptors" in records.loc[("affine", "lattice"), "reason"]
     assert "attacks descriptors with exact zeros" in records.loc[("affine", "sparsity"), "reason"]
 
