@@ -1,6 +1,7 @@
 """Fixtures of several test files."""
 
 import os
+import socket
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -49,6 +50,21 @@ def images(tmp_path: Path) -> Path:
 def small(tmp_path: Path) -> Asset:
     """A dictionary of few words."""
     return write_dictionary(tmp_path)
+
+
+@pytest.fixture
+def no_connections(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Fail at each connection and download, also of weights that torch.hub has in its cache."""
+    import torch
+
+    def refuse(*arguments: object, **options: object) -> None:
+        raise AssertionError(f"a connection: {arguments}")
+
+    monkeypatch.setattr(socket, "create_connection", refuse)
+    monkeypatch.setattr(socket.socket, "connect", refuse)
+    monkeypatch.setattr(torch.hub, "load_state_dict_from_url", refuse)
+    monkeypatch.setattr(torch.hub, "download_url_to_file", refuse)
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
 
 
 @pytest.fixture(scope="session")

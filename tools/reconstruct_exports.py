@@ -56,8 +56,7 @@ def main() -> None:
     parser.add_argument("--work", type=Path, required=True, metavar="DIR", help="a folder for views, databases and models")
     args = parser.parse_args()
     if not (args.work / "walk").exists():
-        scene = Walk(views=VIEWS).scene()
-        scene_export.write(Scene(name=scene.name, references=(), queries=scene.queries), "colmap", args.work / "walk")
+        write_views(Walk(views=VIEWS), args.work)
     rows: list[tuple[str, ...]] = [
         ("defense", "attack", "keypoints", "images in the model", "points", "reprojection error in pixels")
     ]
@@ -68,6 +67,12 @@ def main() -> None:
         rows.append(row)
     used = [entry for defense, attack in EXPORTS for entry in describe(defense, attack)]
     write_page("exports.md", TEXT + "\n".join(map(markdown_row, rows)), used)
+
+
+def write_views(walk: Walk, work: Path) -> None:
+    """Render the views of a walk into the folder `walk` of `work`."""
+    scene = walk.scene()
+    scene_export.write(Scene(name=scene.name, references=(), queries=scene.queries), "colmap", work / "walk")
 
 
 def describe(defense: str, attack: str | None) -> Iterator[dict[str, Any]]:

@@ -12,6 +12,7 @@ from bench import cli
 from bench.codebook import examples
 from bench.codebook.public import Public
 from bench.registry import discovery
+from leaderboard.signal import BASELINES
 
 ROOT = Path(__file__).resolve().parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -49,6 +50,22 @@ def test_results_are_those_of_the_demo(tmp_path: Path) -> None:
     printed = read_table(README[README.index("## Results") :])
     assert list_differences(printed, reported) == []
     assert len(printed) == 7
+
+
+def list_options(page: str) -> set[tuple[str, str]]:
+    """Return the options of the first command of a page that runs XFeat, without those for its folders."""
+    command = re.search(r"^bench run (.*--extractor xfeat(?:.*\\\n)*.*)$", page, re.MULTILINE)
+    assert command is not None
+    words = shlex.split(command[1].replace("\\\n", ""))
+    return {(option, value) for option, value in zip(words[::2], words[1::2], strict=True) if option not in ("--images", "--out")}
+
+
+def test_the_command_of_xfeat_has_the_baselines() -> None:
+    """So that its report tests for a signal. It is also that of the page of learned features."""
+    options = list_options(README)
+    assert options == list_options((ROOT / "docs" / "features.md").read_text(encoding="utf-8"))
+    assert {("--attack", baseline) for baseline in BASELINES} < options
+    assert list_options(README.replace("--attack blank --images photos/ --out runs/xfeat", "--out x")) < options  # control
 
 
 def test_other_results_are_found() -> None:

@@ -17,7 +17,6 @@ from leaderboard.reproduce import command, tables
 ROOT = Path(__file__).resolve().parents[2]
 SCORES = {"MAE", "SSIM", "PSNR", "identified", "recovered", "angle", "mean reciprocal rank", "rank 1", "recall", "precision"}
 MEASUREMENTS = {  # documents with tables of times, memory or trials: why no digest of a network or dictionary can outdate them
-    "formats.md": "seconds of the extractors, which read neither networks nor dictionaries of ours",
     "reliability.md": "seconds, memory and trials depend on the sizes of dictionaries and networks, and not on their content",
     "service-cost.md": "operations, bytes and seconds depend on the sizes of dictionaries and networks, and not on their content",
 }

@@ -9,12 +9,13 @@ from bench import threat_model
 from bench.api import Attack, ImageAttack, PositionAttack
 from bench.registry import discovery
 from bench.threat_model import Knowledge
-from bench.types import Descriptors, Release, Subspaces, WordSets
+from bench.types import Descriptors, Lines, Points, Positions, Release, Subspaces, WordSets
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 PAGE = (DOCS / "threat-models.md").read_text(encoding="utf-8")
 LIST = (DOCS / "attacks.md").read_text(encoding="utf-8")
 RELEASES: dict[str, type[Release]] = {"descriptors": Descriptors, "subspaces": Subspaces, "word sets": WordSets}
+ANY: dict[str, type[Positions]] = {"any": Positions, "any with positions": Points, "any with lines": Lines}
 ATTACKS = {
     attack.name(): attack for attack in discovery.load_plugins(discovery.ATTACK) if attack.__module__.startswith("attacks.")
 }
@@ -36,9 +37,10 @@ def list_wrong_rows(page: str) -> list[str]:
 
 
 def _agrees(attack: type[Attack], releases: str, knowledge: str, recovers: str) -> bool:
-    accepted = RELEASES.values() if releases == "any" else [RELEASES[kind] for kind in releases.split(", ")]
+    accepted = RELEASES.values() if releases in ANY else [RELEASES[kind] for kind in releases.split(", ")]
     return (
         set(accepted) == set(attack.accepts)
+        and (releases not in ANY or attack.accepts_positions == (ANY[releases],))
         and set(re.findall(r"`(\w+)`", knowledge)) == {kind.__name__ for kind in attack.needs}
         and ("image" in recovers.split(", ")) == issubclass(attack, ImageAttack)
         and ("positions" in recovers.split(", ")) == issubclass(attack, PositionAttack)
@@ -55,6 +57,13 @@ def test_rows_have_the_declarations() -> None:
 def test_a_wrong_row_is_noticed(old: str, new: str) -> None:
     row = next(line for line in PAGE.splitlines() if line.startswith("| [`database`]"))
     assert list_wrong_rows(PAGE.replace(row, row.replace(old, new))) == ["database"]
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new"), [("generative", "any with positions", "any"), ("blank", "any", "any with lines")]
+)
+def test_wrong_positions_are_noticed(name: str, old: str, new: str) -> None:
+    assert list_wrong_rows(PAGE.replace(f"(#{name}) | {old} |", f"(#{name}) | {new} |")) == [name]
 
 
 def test_every_kind_of_knowledge_is_explained() -> None:

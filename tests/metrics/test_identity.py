@@ -1,6 +1,7 @@
 """Identity of faces against dlib's own calls, on pairs with known answers, and on non-matching faces."""
 
 import importlib.util
+import urllib.request
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,8 @@ from metrics.identity import Identity
 from metrics.identity_distance import IdentityDistance
 
 dlib = pytest.importorskip("dlib", reason="dlib is not installed (pip install -e '.[identity]')")
+
+pytestmark = pytest.mark.usefixtures("no_connections")
 
 ASTRONAUT, ADMIRAL = (read(source) for source in measure_identity.list_portraits())
 
@@ -134,6 +137,15 @@ def test_few_other_faces_are_accepted(identity: Identity, count: int) -> None:
 def test_contract_of_metrics(plugin: type[Metric], identity: Identity) -> None:
     discovery.check(discovery.METRIC, plugin)
     testing.check_metric(plugin())
+
+
+@pytest.mark.slow
+def test_nothing_is_downloaded(identity: Identity) -> None:
+    for cache in (face_embedding._detect_faces, face_embedding._embed_faces, face_embedding._load_models):
+        cache.cache_clear()
+    assert identity(ASTRONAUT, ASTRONAUT.copy()) == 1.0
+    with pytest.raises(AssertionError, match="a connection"):  # negative control
+        urllib.request.urlopen("http://127.0.0.1:9/shape_predictor_5_face_landmarks.dat")
 
 
 def test_other_files_are_refused(identity: Identity, tmp_path: Path) -> None:

@@ -15,7 +15,12 @@ from bench.registry import discovery
 
 pytest.importorskip("lpips", reason="the library is not installed (pip install -e '.[perceptual]')")
 
+import torchvision
+
+import metrics.perceptual as module
 from metrics.perceptual import Perceptual
+
+pytestmark = pytest.mark.usefixtures("no_connections")
 
 
 @pytest.fixture(scope="module")
@@ -65,8 +70,6 @@ def test_values_of_the_authors_code(
 def test_control_without_blurs_the_values_differ(
     metric: Perceptual, pairs: dict[str, tuple[np.ndarray, np.ndarray]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import metrics.perceptual as module
-
     network = module._load_network(metric.weights)
     for parameter in network.net.parameters():
         if parameter.shape[1:] == (1, 3, 3):  # a filter that keeps the pixel in its centre
@@ -87,6 +90,14 @@ def test_a_shift_of_one_pixel_is_nearer_than_a_slight_blur(
 def test_contract_of_metrics(metric: Perceptual) -> None:
     discovery.check(discovery.METRIC, Perceptual)
     testing.check_metric(metric)
+
+
+@pytest.mark.slow
+def test_nothing_is_downloaded(metric: Perceptual, pairs: dict[str, tuple[np.ndarray, np.ndarray]]) -> None:
+    module._load_network.cache_clear()
+    assert metric(*pairs["same"]) == 0.0
+    with pytest.raises(AssertionError, match="a connection"):  # negative control: weights of another project
+        torchvision.models.alexnet(weights="DEFAULT")
 
 
 @pytest.mark.slow
