@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -238,7 +239,16 @@ def _count_values(records: list[Record], metrics: Sequence[str]) -> Iterator[str
             values = [(record["sample"], record["metrics"].get(name)) for record in records if record["status"] == "ok"]
             every, known = {sample for sample, _ in values}, {sample for sample, value in values if value is not None}
             if known != every:
-                yield f"{name}: over the {len(known)} of {len(every)} {name_samples(records[0]['task'], 2)} that have a value."
+                samples = f"{len(known)} of {len(every)} {name_samples(records[0]['task'], 2)}"
+                yield f"{name}: over the {samples} that have a value{_count_objects(records, name)}."
+
+
+def _count_objects(records: list[Record], name: str) -> str:
+    """Return the number of objects, such as faces, in all samples, by the notes of a metric; empty without such notes."""
+    pattern = re.compile(rf"{re.escape(name)}: (\w+) in the photograph: (\d+)")
+    matches = [(record["sample"], match) for record in records for note in record["notes"] if (match := pattern.fullmatch(note))]
+    counts = {sample: int(match[2]) for sample, match in matches}  # the notes of all experiments on a sample are equal
+    return f", with {sum(counts.values()):,} {matches[0][1][1]}" if matches else ""
 
 
 def _list_notes(records: list[Record], completed: list[Record], signal: Signal | None) -> list[str]:

@@ -56,6 +56,17 @@ def test_a_metric_of_an_extra_states_the_photographs_that_have_a_value() -> None
     assert not any("that have a value" in other for other in table.remarks)
 
 
+def test_the_remark_on_identity_states_the_number_of_faces() -> None:
+    """Each photograph counts once, however many attacks were run on it."""
+    faces = "identity: faces in the photograph:"
+    notes = [[f"{faces} 2"], [f"{faces} 3", "reads: words in the photograph: 9"], [f"{faces} 0"]]
+    values = [{"ssim": 0.5, "identity": value} for value in (1.0, 0.5, None)]
+    records = [record(str(number), metrics=each, notes=notes[number]) for number, each in enumerate(values)]
+    other = [one | {"run_hash": f"other {one['sample']}", "attack": {"name": "blank"}} for one in records]
+    (table,) = tables.build_tables([*records, *other])
+    assert "identity: over the 2 of 3 photographs that have a value, with 5 faces." in table.remarks
+
+
 def localized(sample: str, recall: float, error: float | None) -> dict[str, Any]:
     metrics = {"recall_0.25m_2deg": recall, "translation_error": error}
     return record(sample, task="localization", attack=None, metrics=metrics)
