@@ -8,8 +8,8 @@
   `keypoints` less than the others.
 - **Not monotone in ε**: an attack scores significantly lower at a larger ε of the same defense, where the release says more.
 
-The last two compare the values of `METRICS` by Student's t on differences that are paired by sample, one-sided, with Holm's
-correction over all comparisons of the flag in a comparison group.
+The first two concern an attack by all metrics. The last two compare the values of `METRICS` by Student's t on differences that
+are paired by sample, one-sided, with Holm's correction over all comparisons of the flag in a comparison group.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ NOT_MONOTONE = "not monotone in ε"
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Flag:
-    """An attack that failed by one metric."""
+    """An attack that failed."""
 
     experiment: GroupedExperiment
-    metric: str
+    metric: str | None  # None: by all metrics
     text: str
 
 
@@ -55,7 +55,7 @@ class _Comparison:
 
 
 def flag_attacks(group: ComparisonGroup, results: Sequence[SuiteResult]) -> list[Flag]:
-    """Return the flags of all attacks in the results of one suite. An attack at its baselines has one for each metric."""
+    """Return the flags of all attacks in the results of one suite."""
     values = {
         one: collect_values([record for sample in group.complete_samples(one) for record in sample])
         for result in results
@@ -63,10 +63,9 @@ def flag_attacks(group: ComparisonGroup, results: Sequence[SuiteResult]) -> list
     }
     return [
         *(
-            Flag(experiment=one, metric=metric, text=f"at baseline: {one.attack}")
+            Flag(experiment=one, metric=None, text=f"at baseline: {one.attack}")
             for one in values
             if (signal := group.signals.get(one)) and signal.is_absent
-            for metric in METRICS
         ),
         *_flag_not_converged(values),
         *_flag_weaker(results, values),
@@ -77,10 +76,9 @@ def flag_attacks(group: ComparisonGroup, results: Sequence[SuiteResult]) -> list
 def _flag_not_converged(experiments: Iterable[GroupedExperiment]) -> Iterator[Flag]:
     for one in experiments:
         count = sum(any(note.startswith(NOT_CONVERGED) for note in record["notes"]) for record in one.completed)
-        for metric in METRICS if count else ():
-            yield Flag(
-                experiment=one, metric=metric, text=f"{NOT_CONVERGED}: {one.attack} in {count} of {len(one.completed)} samples"
-            )
+        if count:
+            text = f"{NOT_CONVERGED}: {one.attack} in {count} of {len(one.completed)} samples"
+            yield Flag(experiment=one, metric=None, text=text)
 
 
 def knows_less(one: type[Attack], other: type[Attack]) -> bool:

@@ -41,6 +41,15 @@ class Control:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Utility:
+    """The utility of a defense for a server."""
+
+    measure: Measure
+    mean: float
+    group: ComparisonGroup  # in which it was measured
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class NoiseComparison:
     """The worst case of a defense and that of its control, by one measure."""
 
@@ -138,6 +147,18 @@ def find_control(group: ComparisonGroup, groups: Sequence[ComparisonGroup], resu
             if abs(others[label] - own) <= TOLERANCE:
                 utilities = own, others[label]
                 return Control(label=label, utility=utility, utilities=utilities, experiments=tuple(noises[label]))
+    return None
+
+
+def find_utility(group: ComparisonGroup, groups: Sequence[ComparisonGroup], defense: dict[str, object]) -> Utility | None:
+    """Return the utility of a defense of the group from `groups` of the same features, on the same dataset if it was measured."""
+    content = group.metadata["dataset"]["hash"]
+    for measure in list_measures(UTILITY):
+        for served in sorted(groups, key=lambda one: one.metadata["dataset"]["hash"] != content):
+            if measure in served.measures and list_shared_settings(served) == list_shared_settings(group):
+                mean = _average_utility(served, measure, defense)
+                if mean is not None:
+                    return Utility(measure=measure, mean=mean, group=served)
     return None
 
 

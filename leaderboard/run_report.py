@@ -29,7 +29,7 @@ def write(records: Sequence[Record], out: Path, command: str) -> None:
         if a file cannot be written.
     """
     report = tables.build_tables(records)
-    markdown = "\n".join(to_markdown(table, plain=True) for table in (*report, *build_suite_tables(records)))
+    markdown = "\n".join([*(to_markdown(table, plain=True) for table in report), *map(to_markdown, build_suite_tables(records))])
     (out / "report.md").write_text(markdown, encoding="utf-8", errors="replace")
     (out / "report.csv").write_text(to_csv(*report), encoding="utf-8", errors="replace")
     provenance = format_provenance(command, records)

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from bench.core.hashing import canonical_json
 from bench.runner import attack_suite
 from bench.runner.attack_suite import AttackSuite
+from bench.runner.records import Record
 from leaderboard.comparison import ComparisonGroup, GroupedExperiment
 from leaderboard.intervals import Interval
 from leaderboard.measures import Measure
@@ -34,6 +35,12 @@ class WorstCase:
     experiment: GroupedExperiment  # the attack that reached it
     baselines: Mapping[str, Interval]  # baseline -> its score
     oracle: Interval | None  # the greatest leakage of a reference
+    reference: GroupedExperiment | None  # the oracle that reached it
+
+    @property
+    def is_bracketed(self) -> bool:
+        """Whether an oracle leaks more than the attack. An oracle that leaks less is no ceiling."""
+        return self.oracle is not None and self.measure.better * (self.score.mean - self.oracle.mean) > 0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -47,6 +54,11 @@ class SuiteResult:
     ]  # attack of the suite -> its experiments, also those that do not apply
     missing: tuple[str, ...]  # attacks without results, with the reason
     worst_cases: tuple[WorstCase, ...]  # per measure
+
+    @property
+    def metadata(self) -> Record:
+        """A record, for the fields that are equal in all records of the defense."""
+        return next(one.metadata for each in self.experiments.values() for one in each)
 
     @property
     def version(self) -> str | None:
@@ -123,12 +135,14 @@ def _find_worst_cases(group: ComparisonGroup, experiments: Sequence[GroupedExper
             continue
         worst = find_worst(measure, attacks)
         references = {one: score for one, score in scores.items() if one not in attacks}
+        reference = find_worst(measure, references) if references else None
         yield WorstCase(
             measure=measure,
             score=attacks[worst],
             experiment=worst,
             baselines={name: score for name in BASELINES for one, score in attacks.items() if get_attack(one.metadata) == name},
-            oracle=references[find_worst(measure, references)] if references else None,
+            oracle=references[reference] if reference else None,
+            reference=reference,
         )
 
 

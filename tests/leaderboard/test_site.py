@@ -302,7 +302,7 @@ def test_the_pictures_above_the_table_are_of_one_sample_in_the_order_of_the_rank
     )
     sources = [picture.locator("img").get_attribute("src") for picture in pictures.all()]
     assert len(set(sources)) == 7
-    assert position(page.locator(".overview:visible"))["y"] < position(page.locator("table:visible"))["y"]
+    assert position(page.locator(".overview:visible"))["y"] < position(page.locator(".frame table:visible"))["y"]
     # The same files are in the rows, and in the dialogs.
     rows = page.locator(".group:visible tbody tr:visible .open img")
     assert [row.get_attribute("src") for row in rows.all()] == sources[1:]
@@ -314,7 +314,7 @@ def test_the_pictures_above_the_table_are_of_one_sample_in_the_order_of_the_rank
 
 @pytest.mark.exhaustive
 def test_the_pictures_above_the_table_open_their_experiments_by_keyboard(page: Any) -> None:
-    page.get_by_label("Results").focus()
+    page.locator(".suite summary:visible").first.focus()
     for title in ("ldp against dia", "ldp against dia", "affine against nearest"):
         page.keyboard.press("Tab")
         page.keyboard.press("Enter")

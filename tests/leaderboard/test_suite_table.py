@@ -6,16 +6,17 @@ from typing import Any
 
 import fabricated
 import pytest
-from fabricated import SCORES, STANDARD, inapplicable, ldp, reconstructions, run_suite
+from fabricated import SCORES, STANDARD, inapplicable, ldp, localizations, reconstructions, run_suite
 
-from bench.core.table import to_csv, to_markdown
+from bench.core.table import Row, to_csv, to_markdown
 from bench.registry import discovery
 from bench.runner import attack_suite
 from bench.runner.attack_suite import AttackSuite
-from leaderboard import comparison, site
+from leaderboard import attack_cost, comparison, run_report, site
 from leaderboard.attack_flags import NOT_MONOTONE, WEAKER, flag_attacks, knows_less
 from leaderboard.comparison import ComparisonGroup
-from leaderboard.suite_table import build_run_tables, build_suite_table
+from leaderboard.provenance import read_digests
+from leaderboard.suite_table import NOT_STATED, build_defense_table, build_run_tables, build_suite_table
 from leaderboard.worst_case import SuiteResult, list_results
 
 NEWEST = attack_suite.list_attack_suites()[-1]
@@ -95,6 +96,83 @@ def test_an_attack_without_a_network_is_missing_until_one_is_trained(tmp_path: P
     assert find_result(build_group(tmp_path / "trained", [*records, *trained])).version == STANDARD
 
 
+def find_row(group: ComparisonGroup, groups: Sequence[ComparisonGroup] = ()) -> Row:
+    table = build_defense_table(group, groups)
+    assert table
+    (row,) = table.rows
+    return row
+
+
+def test_the_row_of_a_defense(tmp_path: Path) -> None:
+    digests, scores = read_digests(), {**SCORES, "repeat": 0.3}
+    weights = {"name": "dia", "weights": digests["inversion-ldp.safetensors"]}
+    records = [rebuild(one, attack=weights) if one["attack"]["name"] == "dia" else one for one in run_suite(scores)]
+    row = find_row(build_group(tmp_path, records))
+    stages = 73_600 + 24_000 + 44_800 + 12_000 + 24_000 + 134_400
+    cells = [STANDARD, "n/a", "0.5 [0.4852, 0.5148] by dia, to 0.7 by oracle", "n/a", "ε-LDP, ε = 10 per descriptor"]
+    cost = [f"{stages + 175_000:,}", "1"]  # with the context model; half a second with two threads
+    assert row.texts[1:] == (*cells, *cost, f"{WEAKER}: repeat:releases=2 than dia")
+    assert [row.values[name] for name in ("ssim_attack", "ssim_training_samples", "identified")] == [
+        "dia",
+        stages + 175_000,
+        None,
+    ]
+    assert row.values["ssim_oracle"].mean == pytest.approx(0.7)
+
+
+def test_training_samples_of_other_networks_are_not_stated(tmp_path: Path) -> None:
+    other = {"name": "dia", "weights": "sha256:" + "e" * 64}
+    records = [
+        rebuild(one, attack=other) if one["attack"]["name"] == "dia" else one for one in run_suite({**SCORES, "repeat": 0.3})
+    ]
+    assert NOT_STATED in find_row(build_group(tmp_path, records)).texts
+    assert attack_cost.count_training_samples(other) is None
+    assert attack_cost.count_training_samples({"name": "dia", "weights": "shipped"}) is None
+    assert attack_cost.count_training_samples({"name": "repeat", "releases": 2, "inversion": other}) is None
+
+
+def test_training_samples_of_shipped_files() -> None:
+    """Networks of every kind state them. Dictionaries are no networks."""
+    networks = ("inversion", "context", "neighbours", "positions", "line")
+    for name, digest in read_digests().items():
+        count = attack_cost.count_training_samples({"name": "any", "file": digest})
+        assert count is not None
+        assert (count > 0) == name.startswith(networks), name
+    assert attack_cost.count_training_samples({"name": "density", "width": 8.0}) == 0
+
+
+def test_core_seconds_are_those_of_processors() -> None:
+    environments = [{"threads": 2, "device": "cpu"}, {"threads": 2, "device": "cuda"}, {"device": "cpu"}]
+    records = [{"seconds": seconds, "environment": environment} for environment in environments for seconds in (1.0, 3.0, None)]
+    assert attack_cost.measure_core_seconds(records) == 4.0
+    assert attack_cost.measure_core_seconds(records[3:]) is None
+
+
+@pytest.mark.parametrize(("oracle", "bracket"), [(0.7, ", to 0.7 by oracle"), (0.55, ""), (None, "")])
+def test_a_bracket_needs_an_oracle_that_scores_higher(tmp_path: Path, oracle: float | None, bracket: str) -> None:
+    scores = {name: score for name, score in {**SCORES, "oracle": oracle}.items() if score is not None}
+    row = find_row(build_group(tmp_path, run_suite(scores)))
+    assert row.texts[3] == f"0.6 [0.5852, 0.6148] by repeat:releases=2{bracket}"
+    assert (row.values["ssim_oracle"] is None) == (oracle is None)
+
+
+def test_the_setting_nearest_to_the_fixed_recall_is_marked(tmp_path: Path) -> None:
+    hits = {8.0: [0, 0, 0, 0, 1], 10.0: [0, 0, 1, 1, 1], 12.0: [1] * 5}
+    attacked = {epsilon: run_suite(epsilon=epsilon) for epsilon in hits}
+    served = {epsilon: localizations(ldp(epsilon), each, [None] * 5) for epsilon, each in hits.items()}
+
+    def list_utilities(folder: str, *epsilons: float) -> list[str]:
+        records = [one for epsilon in epsilons for one in (*attacked[epsilon], *served[epsilon])]
+        groups = comparison.build_groups(comparison.load_records(fabricated.write(tmp_path / folder, records)))
+        table = build_defense_table(groups[0], groups)
+        assert table
+        return [row.texts[4] for row in table.rows]
+
+    texts = [f"recall (0.25 m, 2°) {recall} on gallery" for recall in ("0.2", "0.6", "1")]
+    assert list_utilities("several", *hits) == [texts[0], f"{texts[1]}, nearest to 0.5", texts[2]]
+    assert list_utilities("one", 10.0) == [texts[1]]  # there is no choice
+
+
 def test_old_rows_keep_their_version(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     old = attack_suite.find(STANDARD)
     specs = tuple("repeat:releases=3" if text == "repeat:releases=2" else text for text in old.specs)
@@ -125,6 +203,24 @@ def test_an_attack_that_reached_its_budget_is_flagged(tmp_path: Path) -> None:
         rebuild(one, notes=notes.get(one["sample"], [])) if one["attack"]["name"] == "repeat" else one for one in run_suite()
     ]
     assert set(list_flags(build_group(tmp_path, records))) == {"not converged: repeat:releases=2 in 1 of 6 samples"}
+
+
+def list_flags_by_measure(group: ComparisonGroup) -> dict[str, str]:
+    table = build_suite_table(group)
+    assert table
+    return {row.values["measure"]: row.values["flags"] for row in table.rows}
+
+
+def test_flags_that_hold_by_all_measures_are_on_all_rows(tmp_path: Path) -> None:
+    """The comparisons with less knowledge and with other ε are of SSIM and `identified`. Other rows say so."""
+    scores, untested = {**SCORES, "context": 0.2, "repeat": 0.3}, f"not tested: {WEAKER}, {NOT_MONOTONE}"
+    records = [rebuild(one, notes=["not converged: x"]) if one["attack"]["name"] == "dia" else one for one in run_suite(scores)]
+    flags = "at baseline: context:estimate=word; not converged: dia in 6 of 6 samples; "
+    flagged = list_flags_by_measure(build_group(tmp_path / "flagged", records))
+    assert flagged == {"ssim": f"{flags}{WEAKER}: repeat:releases=2 than dia", "mae": flags + untested}
+    assert list_flags_by_measure(build_group(tmp_path / "none", run_suite())) == {"ssim": "", "mae": untested}
+    few = [one for one in run_suite() if one["sample"] in ("0.png", "*")]
+    assert list_flags_by_measure(build_group(tmp_path / "few", few)) == {"ssim": untested, "mae": untested}
 
 
 def test_an_attack_with_more_knowledge_that_scores_lower_is_flagged(tmp_path: Path) -> None:
@@ -207,9 +303,18 @@ def test_table_of_an_incomplete_run_lists_what_is_missing(tmp_path: Path) -> Non
     assert {row.values["suite"] for row in table.rows} == {f"incomplete: {STANDARD}"}
     assert {row.note for row in table.rows} == {"missing: lattice:longest=520 (not run)"}
     assert build_run_tables(records) == []  # the report of a run of single attacks is as before
-    (report,), (terminal,) = build_run_tables(run_suite()), build_run_tables(run_suite(), brief=True)
+    (defenses, report), (_, terminal) = build_run_tables(run_suite()), build_run_tables(run_suite(), brief=True)
+    assert [row.values["suite"] for row in defenses.rows] == [STANDARD]
     assert [row.values["measure"] for row in report.rows] == ["ssim", "mae"]
     assert [row.values["measure"] for row in terminal.rows] == ["ssim"]
+
+
+def test_the_report_lists_what_is_missing(tmp_path: Path) -> None:
+    reason = "no adapted attacker; train one with `bench train`"
+    scores = {name: score for name, score in SCORES.items() if name != "dia"}
+    records = [inapplicable(ldp(10.0), {"name": "dia", "weights": "shipped"}, reason), *run_suite(scores, without=["dia"])]
+    run_report.write(records, tmp_path, "bench run")
+    assert (tmp_path / "report.md").read_text(encoding="utf-8").count("[1] missing: dia (no adapted attacker") == 2
 
 
 @pytest.mark.slow
@@ -217,6 +322,8 @@ def test_the_page_shows_the_worst_cases(tmp_path: Path) -> None:
     fabricated.write(tmp_path / "results", run_suite())
     page = site.write([tmp_path / "results"], tmp_path / "site").page.read_text(encoding="utf-8")
     assert "Worst case over a suite of attacks" in page
-    assert f"<td>{STANDARD}</td>" in page
-    (table,) = (tmp_path / "site" / "tables").glob("*-worst-case.csv")
-    assert STANDARD in table.read_text(encoding="utf-8")
+    assert page.index("Worst case of each defense") < page.index(f"<td>{STANDARD}</td>") < page.index("<details")
+    assert page.index("<details") < page.index('class="frame"')  # the table of pairs
+    for kind in ("defenses", "worst-case"):
+        (table,) = (tmp_path / "site" / "tables").glob(f"*-{kind}.csv")
+        assert STANDARD in table.read_text(encoding="utf-8")

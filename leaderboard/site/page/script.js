@@ -14,12 +14,12 @@ if (choice) {
 // ---- sorting and filtering
 
 for (const group of document.querySelectorAll(".group")) {
-  const body = group.querySelector("tbody");
+  const body = group.querySelector(".frame tbody");
   const rows = [...body.rows]; // in the listed order: by rank
   const filter = group.querySelector(".filter");
   const only = group.querySelector(".only"); // the strongest attack on each defense
   const sorting = group.querySelector(".sorting");
-  const headers = [...group.querySelectorAll("thead th")];
+  const headers = [...group.querySelectorAll(".frame thead th")];
   const texts = new Map(rows.map((row) => [row, row.textContent.toLowerCase()]));
   let column = "";
   let direction = 1;
