@@ -114,6 +114,16 @@ TRAININGS = (
         widths="32,48,64,64",
         options=(*LEARNED, ALIKED),
     ),
+    Training(
+        file="positions-aliked",
+        defenses=("none",),
+        steps=1000,
+        rate=4e-3,
+        photographs="2",
+        initial=None,
+        widths=SMALL,
+        options=(*LEARNED, ALIKED, "--encoding", "positions"),
+    ),
     Training(file="line-inversion", defenses=("lines", "permutation"), steps=3000, widths=NARROW),
 )
 

@@ -6,6 +6,7 @@ import pytest
 
 import bench
 from attacks.dia import DIA
+from attacks.keypoints import Keypoints
 from bench.codebook.public import ASSETS, SHIPPED, Public
 from bench.context import weights as context
 from bench.extractors.sift import Sift
@@ -95,7 +96,10 @@ def test_every_required_release_is_supported(public):
 def test_oriented_descriptors_have_an_attacker_of_their_own(public):
     """The network for upright descriptors reconstructs them far worse, and is not used (control)."""
     oriented = Sift(upright=False)
-    assert "no adapted attacker" in (DIA().explain_not_applicable(LDP(), oriented, public) or "")
+    defenses = [Undefended(), *(Affine(dim=dim) for dim in (2, 4, 16)), *(LDP(epsilon=epsilon) for epsilon in (8.0, 10.0, 16.0))]
+    assert [DIA().explain_not_applicable(defense, oriented, public) for defense in defenses] == [None] * len(defenses)
+    assert Keypoints().explain_not_applicable(LDP(), oriented, public) is None
+    assert "no adapted attacker" in (DIA().explain_not_applicable(LDP(epsilon=20), oriented, public) or "")
     images = [source.path for source in photographs.list_builtin()[:3]]
     adapted = [record["metrics"]["ssim"] for record in bench.run([Undefended()], [DIA()], images, extractor=oriented)]
     upright = weights.load(ASSETS / "inversion-none.safetensors")
