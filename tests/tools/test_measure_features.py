@@ -7,7 +7,7 @@ import measure_features
 import pytest
 import result_page
 from fakes import write_album
-from measure_features import build_row, list_attacks, list_reasons, measure, read_defense
+from measure_features import DEFENSES, EXTRACTORS, LIMITS, TITLE, build_row, list_attacks, list_reasons, measure, read_defense
 from result_page import RECALLS
 
 from bench.cache import store
@@ -67,6 +67,19 @@ def test_each_defense_uses_the_words_of_the_features() -> None:
     assert read_defense("ldp:epsilon=12", "shipped-xfeat") == LDP(epsilon=12.0, dictionary="shipped-xfeat")
     assert read_defense("affine", "shipped-xfeat") == Affine(database="shipped-xfeat")
     assert read_defense("affine", "") == Affine()
+
+
+def test_the_page_of_the_repository_is_that_of_the_tool() -> None:
+    page = (result_page.RESULTS / "features.md").read_text(encoding="utf-8")
+    assert page.startswith(TITLE.format(count=6, low=LIMITS[0], high=LIMITS[1]))
+    rows = [line.split(" | ") for line in page.partition("## Localization")[0].splitlines() if line.startswith("| `")]
+    expected = {
+        (f"| `{features}`", f"`{defense}`", f"`{attack}`")
+        for features in EXTRACTORS
+        for defense in DEFENSES
+        for attack in list_attacks(defense)
+    }
+    assert {(row[0], row[2], row[4]) for row in rows} == expected
 
 
 def test_each_defense_has_the_attacks_on_its_kind_of_release() -> None:
