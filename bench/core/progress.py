@@ -26,11 +26,13 @@ class Progress:
         self._started = self._last = time.monotonic()
 
     def __enter__(self) -> Self:
-        self._bar.start()
+        if self._console.is_terminal:  # otherwise rich 13.7 ends a disabled bar with an empty line
+            self._bar.start()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self._bar.stop()
+        if self._console.is_terminal:
+            self._bar.stop()
 
     def advance(self, count: int = 1, note: str = "") -> None:
         self._done += count

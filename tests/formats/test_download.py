@@ -183,7 +183,10 @@ def test_progress_is_shown(
     server: Server, tmp_path: Path, terminal: bool, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """Of a resumed download too: it starts at the megabytes that are there."""
-    monkeypatch.setenv("FORCE_COLOR", "1" if terminal else "")  # rich takes stderr for a terminal, or not
+    if terminal:
+        monkeypatch.setenv("FORCE_COLOR", "1")  # rich takes stderr for a terminal
+    else:
+        monkeypatch.delenv("FORCE_COLOR", raising=False)
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setattr(progress, "INTERVAL", -1.0)  # seconds
     served = server.files["file"] = Served(CONTENT, end=1_200_000)
