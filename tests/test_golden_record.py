@@ -11,8 +11,8 @@ CASES = list(golden_record.cases())
 QUICK = 4  # image pairs, three defenses
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _same_machine() -> None:
+@pytest.fixture(scope="module")
+def same_machine() -> None:
     machine = golden_record.read(RECORD)[0]
     if machine != golden_record.describe_machine():
         pytest.skip(f"the golden record was written on another machine: {machine}")
@@ -25,11 +25,13 @@ def find_differences(*numbers: int) -> list[str]:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("same_machine")
 def test_releases_and_scores_of_image_pairs() -> None:
     assert find_differences(QUICK) == []
 
 
 @pytest.mark.exhaustive
+@pytest.mark.usefixtures("same_machine")
 @pytest.mark.parametrize("number", [number for number in range(len(CASES)) if number != QUICK])
 def test_releases_and_scores(number: int) -> None:
     assert find_differences(number) == []
@@ -57,7 +59,11 @@ def test_a_new_attack_or_metric_is_no_difference() -> None:
     changed = next(line for line in after if line.get("metrics") and line["attack"])
     changed["metrics"]["another"] = 0.5
     after.append(changed | {"attack": {"name": "another"}})
+    applying = next(line for line in after if line.get("applies") is False)
+    applying["applies"] = True  # a network was trained for it
     assert list(golden_record.find_differences(before, after)) == []
+    (message,) = golden_record.find_differences(after, before)  # the control: it does not apply any more
+    assert "applies was True, is False" in message
 
 
 def test_what_is_gone_is_a_difference() -> None:
