@@ -4,9 +4,9 @@
     python tools/golden_record.py check tests/data/golden.jsonl     # on the code after it, on the same machine
 
 A release must be the same to the last bit, and a score within 1e-6. Attacks and metrics that the file lacks are new, and are not
-compared; nor are attacks that did not apply and do now. Those that are gone are differences. Digests of our own source, which enter
-the keys of rendered images and of a scene's dictionary, are held constant, so that a change of names is no change of content. Other processors and
-libraries round differently: the first line holds both, and `check` says so where they differ.
+compared; nor are attacks that did not apply and do now. Those that are gone are differences. Digests of our own source, which
+enter the keys of rendered images and of a scene's dictionary, are held constant, so that a change of names is no change of content.
+Other processors and libraries round differently: the first line holds both, and `check` says so where they differ.
 """
 
 from __future__ import annotations
@@ -167,8 +167,8 @@ def digest(release: Release) -> str:
 def find_differences(before: Sequence[dict[str, Any]], after: Iterable[dict[str, Any]]) -> Iterator[str]:
     """Yield a message for each difference of a line after the change to the line before it with the same label.
 
-    Lines of new attacks and values of new metrics have none before the change, and are left out. So is an attack that did not apply
-    before, such as one without a network. A line that is gone is reported, if another line of its case is there.
+    Lines of new attacks and values of new metrics have none before the change, and are left out. So is an attack that did not
+    apply before, such as one without a network. A line that is gone is reported, if another line of its case is there.
     """
     known = {label(line): line for line in before}
     attacks = {_name_attack(line) for line in before}
