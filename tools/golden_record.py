@@ -5,7 +5,7 @@
 
 A release must be the same to the last bit, and a score within 1e-6. Attacks and metrics that the file lacks are new, and are not
 compared; nor are attacks that did not apply and do now. Those that are gone are differences. Digests of our own source, which
-enter the keys of rendered images and of a scene's dictionary, are held constant, so that a change of names is no change of content.
+enter the keys of rendered images and of a scene's dictionary, are held constant, so a change of names is no change of content.
 Other processors and libraries round differently: the first line holds both, and `check` says so where they differ.
 """
 
