@@ -124,7 +124,7 @@ def _list_complete(group: ComparisonGroup) -> list[GroupedExperiment]:
 
 def find_control(group: ComparisonGroup, groups: Sequence[ComparisonGroup], result: SuiteResult) -> Control | None:
     """Return the control of a defense; None if no noise in the group has its utility, or the defense is noise itself."""
-    defense = next(one for each in result.experiments.values() for one in each).metadata["defense"]
+    defense = result.metadata["defense"]
     noises: dict[str, list[GroupedExperiment]] = {}
     for one in _list_complete(group):
         if one.metadata["defense"]["name"] == CONTROL:
