@@ -55,32 +55,17 @@ TRAININGS = (
     Training(file="inversion-affine", defenses=("affine",), steps=4500, rate=2e-3, photographs="2", initial="start"),
     Training(file="positions", defenses=("none",), steps=4500, rate=4e-3, initial=None, options=("--encoding", "positions")),
     Training(file="inversion-oriented", defenses=("none",), steps=20_800, rate=4e-3, initial=None, options=ORIENTED),
-    Training(
-        file="inversion-oriented-affine",
-        defenses=("affine",),
-        steps=2000,
-        photographs="2",
-        initial="inversion-oriented",
-        widths=NARROW,
-        options=ORIENTED,
-    ),
-    Training(
-        file="inversion-oriented-ldp",
-        defenses=("ldp",),
-        steps=1600,
-        photographs="2",
-        initial="inversion-oriented",
-        widths=NARROW,
-        options=ORIENTED,
-    ),
-    Training(
-        file="positions-oriented",
-        defenses=("none",),
-        steps=1000,
-        rate=4e-3,
-        initial=None,
-        widths=SMALL,
-        options=(*ORIENTED, "--encoding", "positions"),
+    *(
+        Training(
+            file=f"inversion-oriented-{defense}",
+            defenses=(defense,),
+            steps=steps,
+            photographs="2",
+            initial="inversion-oriented",
+            widths=NARROW,
+            options=ORIENTED,
+        )
+        for defense, steps in (("affine", 2000), ("ldp", 1600))
     ),
     Training(
         file="inversion-xfeat",
@@ -98,15 +83,6 @@ TRAININGS = (
         crossfit=CROSSFIT[0],
     ),
     Training(
-        file="positions-xfeat",
-        defenses=("none",),
-        steps=1000,
-        rate=4e-3,
-        initial=None,
-        widths=SMALL,
-        options=(*LEARNED, "xfeat", "--encoding", "positions"),
-    ),
-    Training(
         file="inversion-aliked",
         defenses=("none", "ldp:dictionary=shipped-aliked,words=0"),
         steps=2600,
@@ -114,15 +90,22 @@ TRAININGS = (
         widths="32,48,64,64",
         options=(*LEARNED, ALIKED),
     ),
-    Training(
-        file="positions-aliked",
-        defenses=("none",),
-        steps=1000,
-        rate=4e-3,
-        photographs="2",
-        initial=None,
-        widths=SMALL,
-        options=(*LEARNED, ALIKED, "--encoding", "positions"),
+    *(
+        Training(
+            file=f"positions-{name}",
+            defenses=("none",),
+            steps=1000,
+            rate=4e-3,
+            photographs=photographs,
+            initial=None,
+            widths=SMALL,
+            options=(*extractor, "--encoding", "positions"),
+        )
+        for name, photographs, extractor in (
+            ("oriented", "012", ORIENTED),
+            ("xfeat", "012", (*LEARNED, "xfeat")),
+            ("aliked", "2", (*LEARNED, ALIKED)),
+        )
     ),
     Training(file="line-inversion", defenses=("lines", "permutation"), steps=3000, widths=NARROW),
 )

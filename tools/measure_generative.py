@@ -191,16 +191,15 @@ def list_scores(label: str, arrays: Arrays, metrics: Sequence[Metric]) -> Iterat
 
 def list_differences(label: str, arrays: Arrays, dia: Arrays, metrics: Sequence[Metric]) -> Iterator[list[str]]:
     """Yield the rows of one attack: the mean image minus a sample, and a sample minus `dia`."""
-    for kind in ("mean image - a sample", "a sample - `dia`"):
+    names = [metric.name() for metric in metrics]
+    samples = {name: arrays[name].mean(axis=1) for name in names}  # (n,)
+    differences = {
+        "mean image - a sample": [arrays[f"{name} of mean"][:, 0] - samples[name] for name in names],
+        "a sample - `dia`": [samples[name] - dia[name][:, 0] for name in names],
+    }
+    for kind, columns in differences.items():
         row = [label, kind]
-        for metric in metrics:
-            sample = arrays[metric.name()].mean(axis=1)
-            pair = (
-                (arrays[f"{metric.name()} of mean"][:, 0], sample)
-                if kind.startswith("mean")
-                else (sample, dia[metric.name()][:, 0])
-            )
-            difference = pair[0] - pair[1]
+        for difference in columns:
             present = difference[~np.isnan(difference)]
             row.append(format_interval(interval(present), 3) if len(present) else "n/a")
         yield row
