@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bench.api import Defense
+from bench.cache import feature_cache
 from bench.codebook.dictionary import Dictionary
 from bench.codebook.public import Public
 from bench.core.errors import SampleError, UserError
@@ -30,6 +31,7 @@ from bench.settings import Asset, Between, OneOf
 from bench.types import Bytes, Features, Floats, Indices, Release
 
 SupportedSettings = Mapping[str, Between | OneOf]
+STORED_ROWS = 20_000  # descriptors whose nearest words are one entry of the cache; some 10 s of search in 256,000 words
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -175,7 +177,7 @@ def quantise(
     """Find the nearest words of all descriptors in the dictionary of their photograph, at each of `sizes`.
 
     `sizes` descend; 0, which stands for all words, comes first. The nearest of many words is also the nearest of fewer words that
-    contain it.
+    contain it. Words are stored in the cache as they are found, so an interrupted training does not search for them again.
     """
     tables = {}
     total = len(sizes) * sum(len(view.features) for view in views)
@@ -188,10 +190,19 @@ def quantise(
                 dictionary = public.dictionary(asset, size)
                 missing = words >= len(dictionary)
                 words = words.copy()
-                words[missing] = dictionary.index.find_nearest(rows[first[missing]], progress.advance)
+                words[missing] = _find_nearest_words(dictionary, rows[first[missing]], progress)
                 tables[dictionary.digest] = (keys, words)
                 progress.advance(len(rows) - int(missing.sum()))
     return Quantisation(tables)
+
+
+def _find_nearest_words(dictionary: Dictionary, rows: Bytes | Floats, progress: Progress) -> Indices:
+    words = np.empty(len(rows), dtype=np.int64)
+    for start in range(0, len(rows), STORED_ROWS):
+        part = rows[start : start + STORED_ROWS]
+        words[start : start + STORED_ROWS] = feature_cache.find_nearest_words(dictionary, part)
+        progress.advance(len(part))
+    return words
 
 
 def _find_first_occurrences(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -13,6 +13,7 @@ from bench.codebook import build, dictionary
 from bench.codebook.public import Public
 from bench.core.errors import UserError
 from bench.extractors.sift import Sift
+from bench.geometry.nearest_words import WordIndex
 from bench.images import photographs
 from bench.images.photographs import Source
 from bench.images.views import LazyViews, collect_views
@@ -419,6 +420,36 @@ def test_the_quantisation_table_agrees_with_single_queries(sources, words):
             assert np.array_equal(table(plain.dictionary(words, size), view.features.codes), expected)
     with pytest.raises(KeyError):
         table(plain.dictionary(words), np.full((1, 128), 7, np.uint8))
+
+
+def test_an_interrupted_quantisation_resumes_where_it_ended(sources, words, monkeypatch, tmp_path):
+    monkeypatch.setenv("FEATURE_PRIVACY_CACHE", str(tmp_path))
+    monkeypatch.setattr(data, "STORED_ROWS", 100)
+    views, searched = collect_views(sources[3:4], Sift()), []
+    arguments = views, {view.photograph: words for view in views}, [0, 500]
+    find_nearest = WordIndex.find_nearest
+
+    def search(index, queries, *more):
+        searched.append(len(queries))
+        if len(searched) == 3:
+            raise KeyboardInterrupt
+        return find_nearest(index, queries, *more)
+
+    monkeypatch.setattr(WordIndex, "find_nearest", search)
+    with pytest.raises(KeyboardInterrupt):
+        data.quantise(*arguments, Public())
+    resumed = data.quantise(*arguments, Public())
+    before = len(searched)
+    again = data.quantise(*arguments, Public())
+    assert len(searched) == before  # every word is stored
+    with monkeypatch.context() as empty:
+        empty.setenv("FEATURE_PRIVACY_CACHE", str(tmp_path / "empty"))
+        whole = data.quantise(*arguments, Public())
+    assert len(searched) == 2 * before - 1  # the search that was interrupted is the only one that was repeated
+    for table in (resumed, again):
+        for digest, (keys, found) in whole.tables.items():
+            assert np.array_equal(table.tables[digest][0], keys)
+            assert np.array_equal(table.tables[digest][1], found)
 
 
 def test_crops_contain_the_keypoints_inside_them(sources, rng):
