@@ -25,6 +25,8 @@ BLOCK = 8192  # words in a block, so that 16-bit integers hold their counts
 BATCH = 128  # words per query batch
 CACHE_LIMIT = 2**29  # greatest size of a cached table of levels
 MIN_WIDTH = 8  # nearest words that are found at least
+GROUP = 64  # words of which only the greatest score is compared
+SLACK = 2.0**-20  # above the relative error of a score in float32, which is below 2^-22
 INTERVALS = 1024  # intervals of cosines from 0 to 1, in which levels are looked up
 
 
@@ -57,32 +59,25 @@ class Neighbours:
         return np.sort(table[words, :count], axis=1)
 
     def _find(self, words: Indices, count: int) -> Indices:
-        """Return the nearest words of each word, nearest first. (n,) -> (n, count)"""
+        """Return the nearest words of each word, nearest first. (n,) -> (n, count)
+
+        Float32 scores exclude all words but a few, and cosines in float64 order these.
+        """
         import torch
 
-        rows = torch.from_numpy(words)
-        blocks = (self._compute_cosines_own_first(rows, at) for at in self._starts())
-        tops = torch.cat([block.topk(min(count, block.shape[1]), dim=1).values for block in blocks], dim=1)
-        least = tops.topk(count, dim=1).values[:, -1:]  # (n, 1)
-        parts = [[part.cpu().numpy() for part in self._select_at_least(rows, least, at)] for at in self._starts()]
-        owners, others, cosines = (np.concatenate(part) for part in zip(*parts, strict=True))
-        order = np.lexsort((others, -cosines, owners))
-        first = np.searchsorted(owners[order], np.arange(len(words)))
-        return others[order][first[:, None] + np.arange(count)]
-
-    def _select_at_least(self, rows: Tensor, least: Tensor, start: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Select pairs of a row and a word of the block with cosine at least `least`. -> (P,), (P,), (P,)"""
-        cosines = self._compute_cosines_own_first(rows, start)
-        owners, others = (cosines >= least).nonzero(as_tuple=True)
-        return owners, others + start, cosines[owners, others]
-
-    def _compute_cosines_own_first(self, rows: Tensor, start: int) -> Tensor:
-        """Compute cosines with the words of a block, 2 for the word itself. -> (n, b)"""
-        cosines = self._compute_cosines(rows, start)
-        own = rows - start
-        inside = (own >= 0) & (own < cosines.shape[1])
-        cosines[inside.nonzero()[:, 0], own[inside]] = 2.0
-        return cosines
+        rows = torch.from_numpy(words).to(self._words.device)
+        scores = (self._words[rows] @ self._words.T) / self._lengths.float()  # (n, K)
+        scores[torch.arange(len(rows)), rows] = torch.inf  # of the word itself
+        least = _find_lower_bound(scores, count)  # (n, 1)
+        owners, others = (scores >= least - SLACK * least.abs()).nonzero(as_tuple=True)
+        own = rows[owners]
+        dots = (self._words[own] * self._words[others]).sum(dim=1).double()
+        cosines = dots / (self._lengths[own] * self._lengths[others])
+        cosines[own == others] = 2.0
+        row, word, cosine = (part.cpu().numpy() for part in (owners, others, cosines))
+        order = np.lexsort((word, -cosine, row))
+        first = np.searchsorted(row[order], np.arange(len(words)))
+        return word[order][first[:, None] + np.arange(count)]
 
     def _compute_cosines(self, rows: Tensor, start: int) -> Tensor:
         """Compute cosines of `rows` with the words of a block, in float64. -> (n, b)"""
@@ -182,6 +177,13 @@ class _Levels:
         mixed = (levels < 0).nonzero(as_tuple=True)
         levels[mixed] = torch.bucketize(cosines[mixed], self._borders, right=True)
         return levels
+
+
+def _find_lower_bound(scores: Tensor, count: int) -> Tensor:
+    """Return a lower bound of the count-th greatest score of each row: of the greatest of each group. (n, K) -> (n, 1)"""
+    group = max(1, min(GROUP, scores.shape[1] // count))
+    whole = scores.shape[1] // group * group
+    return scores[:, :whole].unflatten(1, (-1, group)).amax(dim=2).topk(count, dim=1).values[:, -1:]
 
 
 def _count_per_row(levels: Tensor, count: int) -> Indices:
