@@ -20,24 +20,20 @@ apply.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from bench.api import Defense, Extractor, ImageAttack, View
-from bench.codebook.public import ASSETS, Public
-from bench.context import weights as context
+from bench.codebook.public import Public
 from bench.core.errors import UserError
-from bench.inversion.symmetry import Symmetry, find_symmetries
-from bench.inversion.weights import Network, find_network, load
+from bench.inversion.symmetry import find_symmetries
+from bench.inversion.weights import SHIPPED, Network, find_network, load
 from bench.settings import Asset
 from bench.threat_model import PublicAssets
-from bench.types import Descriptors, Floats, Release, Subspaces, WordSets
-
-# File names of the shipped networks. As printed: the input is the words of a set, or origin and basis of a subspace, stacked.
-SHIPPED = {"shipped": "inversion-*.safetensors", "shipped-as-printed": "as-printed-*.safetensors"}
+from bench.types import Descriptors, Floats, Subspaces, WordSets
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,55 +51,23 @@ class DIA(ImageAttack):
     def assets(self, defense: Defense, extractor: Extractor, public: Public) -> Mapping[str, str]:
         network = self._network(defense, extractor, public)
         if network.meta["encoding"] == "posteriors":
-            _load_context(network).verify()
+            from bench.context.reconstruct import load_context
+
+            load_context(network).verify()
         return {"weights": network.verify()}  # its metadata have the digest of the context model
 
     def reconstruct(self, view: View, rng: np.random.Generator) -> Floats:
-        from bench.inversion.reconstruct import reconstruct_image
+        from bench.context.reconstruct import reconstruct_release
 
         public = view.know(PublicAssets).assets
         network = self._network(view.defense, view.extractor, public)
-        symmetries = find_symmetries(view.extractor)
-        if network.meta["encoding"] == "posteriors":
-            return _weigh_and_reconstruct(network, view.release, view.defense, symmetries, public)
-        settings = network.encode_settings(view.defense, public)
-        return reconstruct_image(
-            network.module, view.release, symmetries, settings, network.meta["slots"], network.meta["encoding"]
-        )
+        return reconstruct_release(network, view.release, view.defense, find_symmetries(view.extractor), public)
 
     def _network(self, defense: Defense, extractor: Extractor, public: Public) -> Network:
         path, reason = _choose(self.weights, defense, extractor, public)
         if path is None:
             raise UserError(f"dia: {reason}")
         return load(path)
-
-
-def _weigh_and_reconstruct(
-    network: Network, release: Release, defense: Defense, symmetries: Sequence[Symmetry], public: Public
-) -> Floats:
-    """Reconstruct with the posteriors of the context model that the network was trained with."""
-    from bench.context.encoding import prior_odds
-    from bench.context.reconstruct import reconstruct_from_posteriors
-    from bench.inversion.network import Inverter
-
-    if not isinstance(release, WordSets) or not isinstance(network.module, Inverter):
-        raise TypeError(f"{network.path} reads WordSets, got {type(release).__name__}")
-    odds = prior_odds(defense, public, release.subset_size)
-    return reconstruct_from_posteriors(network.module, _load_context(network).module, release, odds, symmetries)
-
-
-def _load_context(network: Network) -> context.Network:
-    """Load the context model that a network was trained with.
-
-    Raises
-    ------
-    UserError
-        if the installed one is another.
-    """
-    installed = context.load(ASSETS / "context.safetensors")
-    if installed.digest != network.meta.get("context"):
-        raise UserError(f"dia: {network.path} was trained with another context model than {installed.path}; reinstall")
-    return installed
 
 
 def _choose(asset: str, defense: Defense, extractor: Extractor, public: Public) -> tuple[Path | None, str | None]:

@@ -5,7 +5,8 @@ localization uses conditional diffusion likewise.
 
 Method (`bench/inversion/flow.py`):
 
-1. Encode each keypoint of the release as `dia` does, and scatter the embeddings to a grid of cells of 4 x 4 pixels.
+1. Encode each keypoint of the release as `dia` does, and scatter the embeddings to a grid of cells of 4 x 4 pixels. Add the
+   reconstruction of the network of `dia`, the draft, if the network was trained with drafts.
 2. Start at Gaussian noise and follow a learned velocity to a photograph, in `steps` steps of Heun's method.
 3. With `guidance` w, the velocity is u + w (v - u), for the velocity v given the release and the velocity u of the prior.
 4. Return the mean of `samples` samples.
@@ -24,17 +25,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from bench.api import Defense, Extractor, ImageAttack, View
 from bench.codebook.public import Public
 from bench.core.errors import UserError
+from bench.inversion.weights import SHIPPED as DRAFTS
 from bench.inversion.weights import Network, find_network, load
 from bench.settings import Asset
 from bench.threat_model import PublicAssets
 from bench.types import Descriptors, Floats, Subspaces, WordSets
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 SHIPPED = {"shipped": "flow-*.safetensors"}
 
@@ -47,6 +53,7 @@ class Generative(ImageAttack):
     needs = frozenset({PublicAssets})
 
     weights: Asset = Asset("shipped")
+    drafts: Asset = Asset("shipped")  # a network for drafts, if `weights` was trained with another than that of `dia`
     samples: int = 1
     steps: int = 12  # of the solver, with two evaluations of the velocity each
     guidance: float = 1.0  # 0: the prior; 1: the posterior; more: images that are likelier for this release than for others
@@ -60,7 +67,7 @@ class Generative(ImageAttack):
     def explain_incompatible(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
         path, details = find_network(self.weights, SHIPPED, defense, extractor, public, model="flow")
         if path is not None:
-            return None
+            return self._explain_other_drafts(load(path), defense, extractor, public)
         return f"no adapted attacker{details}; train one with `bench train --model flow` and pass generative:weights=FILE"
 
     def assets(self, defense: Defense, extractor: Extractor, public: Public) -> Mapping[str, str]:
@@ -79,8 +86,29 @@ class Generative(ImageAttack):
         settings, module = network.encode_settings(view.defense, public), network.module
         assert isinstance(module, FlowNetwork)  # by the metadata
         points = encode([view.release], [settings], network.meta["slots"], network.meta["encoding"])
+        if module.shape.drafts:
+            points = replace(points, drafts=self._draft(view, public))
         images = sample_images(module, points, self.samples, self.steps, self.guidance, rng)
         return images.permute(0, 2, 3, 1).cpu().numpy()
+
+    def _draft(self, view: View, public: Public) -> Tensor:
+        """Return the reconstruction that the network reads. -> (1, 3, H, W)"""
+        import torch
+
+        from bench.context.drafts import Drafter
+
+        image = Drafter(self.drafts, view.extractor)(view.defense, view.release, public)
+        return torch.from_numpy(image).permute(2, 0, 1)[None]
+
+    def _explain_other_drafts(self, network: Network, defense: Defense, extractor: Extractor, public: Public) -> str | None:
+        """Return the reason why there are no drafts as the network was trained with; None if there are, or it reads none."""
+        digests = network.meta.get("drafts")
+        if digests is None:
+            return None
+        path, details = find_network(self.drafts, DRAFTS, defense, extractor, public)
+        if path is not None and load(path).digest == digests.get(defense.name()):
+            return None
+        return f"{network.path.name} reads drafts of another network{details}; pass that one with generative:drafts=FILE"
 
     def _network(self, defense: Defense, extractor: Extractor, public: Public) -> Network:
         path, details = find_network(self.weights, SHIPPED, defense, extractor, public, model="flow")

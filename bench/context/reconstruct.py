@@ -12,13 +12,51 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bench.context.encoding import build_graph
+from bench.api import Defense
+from bench.codebook.public import ASSETS, Public
+from bench.context import weights
+from bench.context.encoding import build_graph, prior_odds
 from bench.context.network import ContextModel
+from bench.core.errors import UserError
 from bench.inversion.encoding import EncodedRelease, encode
 from bench.inversion.network import Inverter
-from bench.inversion.reconstruct import average_reconstructions
+from bench.inversion.reconstruct import average_reconstructions, reconstruct_image
 from bench.inversion.symmetry import Symmetry
-from bench.types import Floats, WordSets
+from bench.inversion.weights import Network
+from bench.types import Floats, Release, WordSets
+
+
+def reconstruct_release(
+    network: Network, release: Release, defense: Defense, symmetries: Sequence[Symmetry], public: Public
+) -> Floats:
+    """Return the mean reconstruction by a network, with the context model that it was trained with. -> (H, W, 3) in [0, 1]
+
+    Raises
+    ------
+    UserError
+        if the installed context model is another.
+    """
+    if network.meta["encoding"] != "posteriors":
+        settings = network.encode_settings(defense, public)
+        return reconstruct_image(network.module, release, symmetries, settings, network.meta["slots"], network.meta["encoding"])
+    if not isinstance(release, WordSets) or not isinstance(network.module, Inverter):
+        raise TypeError(f"{network.path} reads WordSets, got {type(release).__name__}")
+    odds = prior_odds(defense, public, release.subset_size)
+    return reconstruct_from_posteriors(network.module, load_context(network).module, release, odds, symmetries)
+
+
+def load_context(network: Network) -> weights.Network:
+    """Load the context model that a network was trained with.
+
+    Raises
+    ------
+    UserError
+        if the installed one is another.
+    """
+    installed = weights.load(ASSETS / "context.safetensors")
+    if installed.digest != network.meta.get("context"):
+        raise UserError(f"{network.path} was trained with another context model than {installed.path}; reinstall")
+    return installed
 
 
 def reconstruct_from_posteriors(

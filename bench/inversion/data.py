@@ -50,6 +50,7 @@ class Example:
     release: Release
     settings: Floats  # (C,)
     keypoints: Floats  # (N, 2) the true ones, which the release may hide
+    defense: Defense  # with its settings, as the attacker knows it
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,11 +94,11 @@ class Examples:
         number = int(rng.integers(len(self.targets))) if len(self.targets) > 1 else 0
         target = self.targets[number]
         settings: dict[str, object] = {field: setting.sample(rng) for field, setting in target.supported_settings.items()}
+        known = defense = configure(target.defense, settings)
         if target.defense.dictionary_field is not None:
-            settings[target.defense.dictionary_field] = self.dictionaries[photograph]
-        defense = configure(target.defense, settings)
+            defense = configure(target.defense, settings | {target.defense.dictionary_field: self.dictionaries[photograph]})
         condition = encode_settings(defense, number, [target.supported_settings for target in self.targets])
-        return Example(pixels, defense.protect(secret, self.public, rng), condition, secret.keypoints)
+        return Example(pixels, defense.protect(secret, self.public, rng), condition, secret.keypoints, known)
 
 
 def draw_crop(view: PhotographView, rng: np.random.Generator) -> tuple[Bytes, Features]:

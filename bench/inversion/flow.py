@@ -12,7 +12,8 @@ the network learns the mean of the velocity, photograph - noise, given x_t, t an
 follows the velocity to t = 1. With probability `DROPPED` a training sample has no release. So the same network also learns the
 velocity of the prior, u. With guidance w, a sample follows u + w (v - u): w = 0 gives the prior, w = 1 the posterior.
 
-The network is the inversion network up to the features of each cell. Its input also has x_t, and t shifts the levels. If cells
+The network is the inversion network up to the features of each cell. Its input also has x_t, and t shifts the levels. With
+`drafts`, it has the coefficients of another network's reconstruction too, which is lost together with the release. If cells
 were independent Gaussians, the velocity would be (2t - 1) / D x_t, with D = (1 - t)² + t². The head predicts the rest, which
 has variance 1 / D.
 
@@ -59,6 +60,9 @@ class FlowNetwork(GridNetwork):
         self.register_buffer("mean", torch.zeros(CHANNELS, 1, 1))
         self.register_buffer("spread", torch.ones(CHANNELS, 1, 1))
         self.read = nn.Conv2d(CHANNELS, self.channels, 1)
+        if shape.drafts:
+            self.read_draft = nn.Conv2d(CHANNELS, self.channels, 3, padding=1, bias=False)
+            nn.init.zeros_(self.read_draft.weight)  # untrained: as without drafts
         self.time = nn.Sequential(nn.Linear(2 * FREQUENCIES, TIME_WIDTH), nn.SiLU())
         self.shifts = nn.ModuleList(nn.Linear(TIME_WIDTH, width) for width in shape.widths)
         last = nn.Conv2d(WIDTH, CHANNELS, 3, padding=1)
@@ -75,11 +79,21 @@ class FlowNetwork(GridNetwork):
         photographs = self.to_cells(batch.photographs)
         time = batch.time[:, None, None, None]
         noisy = (1 - time) * batch.noise + time * photographs
-        error = self.predict(self.scatter(batch), noisy, batch.time) - (photographs - batch.noise)
+        error = self.predict(self.build_condition(batch), noisy, batch.time) - (photographs - batch.noise)
         return error * (self.spread / self.spread.mean()).sqrt()
 
+    def build_condition(self, points: EncodedRelease) -> Tensor:
+        """Return what the network reads of releases and their drafts, zero without a release. -> (B, C, H/4, W/4)"""
+        condition = self.scatter(points)
+        if not self.shape.drafts:
+            return condition
+        if points.drafts is None:
+            raise ValueError("the network reads drafts, and there are none")
+        drafts = self.read_draft(self.to_cells(points.drafts))
+        return condition + (drafts if points.drafted is None else drafts * points.drafted[:, None, None, None])
+
     def predict(self, condition: Tensor, noisy: Tensor, time: Tensor) -> Tensor:
-        """Return the velocity. (B, C, H/4, W/4) from `scatter`, (B, 48, H/4, W/4), (B,) -> (B, 48, H/4, W/4)"""
+        """Return the velocity. (B, C, H/4, W/4) from `build_condition`, (B, 48, H/4, W/4), (B,) -> (B, 48, H/4, W/4)"""
         rows, columns = noisy.shape[2:]
         embedded = self.time(embed_time(time))
         shifts = [shift(embedded)[:, :, None, None] for shift in self.shifts]
@@ -141,8 +155,9 @@ def add_noise(points: Encoded, photographs: Tensor, rngs: Sequence[np.random.Gen
     noise = np.stack([rng.standard_normal((CHANNELS, *points.grid), np.float32) for rng in rngs])
     time = np.array([warp_time(rng.random()) for rng in rngs], np.float32)
     dropped = np.array([rng.random() < DROPPED for rng in rngs])
+    kept = torch.from_numpy(~dropped).float()
     return NoisyRelease(
-        **vars(points) | {"weights": torch.from_numpy(~dropped).float()[points.image]},
+        **vars(points) | {"weights": kept[points.image], "drafted": kept},
         photographs=photographs,
         noise=torch.from_numpy(noise),
         time=torch.from_numpy(time),
@@ -174,7 +189,7 @@ def sample_images(
     device = module.mean.device
     noise = torch.from_numpy(rng.standard_normal((count, CHANNELS, *points.grid), np.float32)).to(device)
     with autocast(module):
-        velocity = guide(module, module.scatter(points.to(device)), guidance)
+        velocity = guide(module, module.build_condition(points.to(device)), guidance)
         cells = solve(velocity, noise, [warp_time(step / steps) for step in range(steps + 1)])
     return module.to_images(cells, points.size).clamp(0, 1)
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Protocol
 
-from bench.api import Extractor
+from bench.api import Defense, Extractor
+from bench.codebook.public import Public
 from bench.core.errors import UserError
 from bench.images.photographs import Source
 from bench.images.views import LIMIT, RandomLimit
@@ -15,8 +16,19 @@ from bench.inversion.data import Target
 from bench.inversion.encoding import Encoding
 from bench.inversion.network import COARSENET, Shape
 from bench.settings import Asset
+from bench.types import Floats, Release
 
 Model = Literal["inversion", "flow"]  # a network that reconstructs the photograph, or one that samples photographs
+
+
+class Drafts(Protocol):
+    """Makes drafts for a network that reads them (`bench.context.drafts`)."""
+
+    def digest(self, defense: Defense, public: Public) -> str:
+        """Return the digest of what makes the drafts for a defense."""
+
+    def __call__(self, defense: Defense, release: Release, public: Public) -> Floats:
+        """Return the draft of a release. -> (H, W, 3) in [0, 1]"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,11 +60,14 @@ class Plan:
     initial_checkpoint: Path | None = None  # a network for the same kind of releases or for raw descriptors; None: random weights
     encoding: Encoding = "invariant"  # input of the network
     model: Model = "inversion"
+    drafts: Drafts | None = None  # of the photographs, which the model "flow" reads beside the release
     widths: tuple[int, ...] = Shape.widths  # of the network's levels
     training: Training = Training()  # frozen
     keypoints: tuple[int, int] | None = None  # limits of each view's `max_keypoints`, drawn at random; None: the extractor's
 
     def __post_init__(self) -> None:
+        if self.drafts is not None and self.model != "flow":
+            raise UserError("--drafts: only --model flow reads drafts")
         if self.keypoints is None:
             return
         if len(self.keypoints) != 2 or not 1 <= self.keypoints[0] <= self.keypoints[1]:

@@ -45,7 +45,7 @@ from bench.inversion.line_network import SAMPLES, LineInverter
 from bench.inversion.log import Log
 from bench.inversion.loss import ssim
 from bench.inversion.network import Shape
-from bench.inversion.plan import Plan, Training
+from bench.inversion.plan import Drafts, Plan, Training
 from bench.inversion.process_group import ProcessGroup, launch
 from bench.inversion.reconstruct import infer, locate_keypoints
 from bench.inversion.symmetry import IDENTITY, POSITION_SYMMETRIES, find_symmetries
@@ -99,14 +99,23 @@ def train_worker(group: ProcessGroup, plan: Plan, out: Path, log: Path | None) -
     samples = _count_samples(targets, encoding)
     if plan.model == "flow" and samples:
         raise UserError("--model flow: it reads points, and the defense hides positions; pass another --defense")
+    drafts = plan.drafts and {target.defense.name(): plan.drafts.digest(target.defense, Public()) for target in targets}
     sample, _ = build_batch([first], slots, encoding, samples)
     candidates = slots if encoding == "invariant" and sets else 0
-    shape = Shape(inputs=sample.values.shape[1], candidates=candidates, length=length, widths=plan.widths, samples=samples)
+    shape = Shape(
+        inputs=sample.values.shape[1],
+        candidates=candidates,
+        length=length,
+        widths=plan.widths,
+        drafts=plan.drafts is not None,
+        samples=samples,
+    )
     initial = None if plan.initial_checkpoint is None else weights.load(plan.initial_checkpoint)
     meta = {
         **weights.describe(targets, extractor, Public(), plan.keypoints),
         "encoding": encoding,
         "model": plan.model if plan.model != "inversion" else None,
+        "drafts": drafts,
         "slots": slots,
         "start": initial and initial.digest,
         "earlier": [] if initial is None else weights.list_training_stages(initial.meta),
@@ -123,14 +132,14 @@ def train_worker(group: ProcessGroup, plan: Plan, out: Path, log: Path | None) -
         finished = weights.load(out).meta
         _check_same_training(out, finished, meta)
         return finished
-    trainer = _Trainer(group, shape, training, out, meta, writer)
+    trainer = _Trainer(group, shape, training, out, meta, writer, plan.drafts)
     if trainer.step == 0:
         descriptor_slots = slots if sets and not candidates else 1
         trainer.initialise(views, None if initial is None else initial.module, descriptor_slots)
     module = trainer.run(examples)
     if not group.is_main:
         return meta
-    meta["validation"] = validate(module, held_out, unseen[:MAX_VALIDATED], slots, encoding)
+    meta["validation"] = validate(module, held_out, unseen[:MAX_VALIDATED], slots, encoding, plan.drafts)
     writer.add_scalars({f"validation/{name}": value for name, value in meta["validation"].items()}, training.steps)
     writer.close()
     weights.save(out, module, shape, meta)
@@ -284,10 +293,19 @@ def _checkpoint_path(out: Path) -> Path:
 class _Trainer(Learner[AnyNetwork]):
     """A learner with its part of each batch, and a checkpoint to resume from."""
 
-    def __init__(self, group: ProcessGroup, shape: Shape, training: Training, out: Path, meta: dict[str, Any], log: Log) -> None:
+    def __init__(
+        self,
+        group: ProcessGroup,
+        shape: Shape,
+        training: Training,
+        out: Path,
+        meta: dict[str, Any],
+        log: Log,
+        drafts: Drafts | None,
+    ) -> None:
         torch.manual_seed(training.seed)
         super().__init__(build_network(shape, meta["model"]), training)
-        self.group, self.meta, self.log = group, meta, log
+        self.group, self.meta, self.log, self.drafts = group, meta, log, drafts
         self.path = _checkpoint_path(out)
         if self.path.is_file():
             self._restore()
@@ -326,6 +344,8 @@ class _Trainer(Learner[AnyNetwork]):
             rngs = [np.random.default_rng([training.seed, step, index]) for index in indices]
             batch = [examples.draw(rng) for rng in rngs]
             points, photographs = build_batch(batch, self.meta["slots"], self.meta["encoding"], self.module.shape.samples)
+            if self.drafts is not None:
+                points = add_drafts(points, batch, self.drafts, examples.public)
             return (add_noise(points, photographs, rngs) if isinstance(self.module, FlowNetwork) else points), photographs
 
         workers = max(1, (os.cpu_count() or 1) // self.group.size) if isinstance(examples.views, LazyViews) else 1
@@ -379,8 +399,20 @@ def build_batch(examples: Sequence[Example], slots: int, encoding: Encoding, sam
     return points, pixels.permute(0, 3, 1, 2).float() / 255
 
 
+def add_drafts(points: Encoded, examples: Sequence[Example], drafts: Drafts, public: Public) -> Encoded:
+    """Add the drafts of the examples to their encoded releases."""
+    assert isinstance(points, EncodedRelease)  # only the model "flow" reads drafts, and it reads points
+    images = np.stack([drafts(example.defense, example.release, public) for example in examples])
+    return dataclasses.replace(points, drafts=torch.from_numpy(images).permute(0, 3, 1, 2))
+
+
 def validate(
-    module: AnyNetwork, examples: Examples, views: Sequence[PhotographView], slots: int, encoding: Encoding
+    module: AnyNetwork,
+    examples: Examples,
+    views: Sequence[PhotographView],
+    slots: int,
+    encoding: Encoding,
+    drafts: Drafts | None = None,
 ) -> dict[str, float]:
     """Return mean MAE, SSIM (where its window fits) and PSNR over whole views. Settings are drawn with a fixed seed.
 
@@ -392,6 +424,8 @@ def validate(
     for view in views:
         example = examples.release_view(view, rng)
         points, truth = build_batch([example], slots, encoding, module.shape.samples)
+        if drafts is not None:
+            points = add_drafts(points, [example], drafts, examples.public)
         if isinstance(module, FlowNetwork) and isinstance(points, EncodedRelease):
             images = sample_images(module, points, 1, VALIDATION_STEPS, 1.0, rng)
             losses.append(measure_loss(module, add_noise(points, truth, [rng])))

@@ -31,6 +31,9 @@ if TYPE_CHECKING:
     from bench.inversion.network import GridNetwork, Shape
 
 KIND = "inversion-network"
+# File names of the shipped networks that reconstruct the photograph from points. As printed: the input is the words of a set, or
+# origin and basis of a subspace, stacked.
+SHIPPED = {"shipped": "inversion-*.safetensors", "shipped-as-printed": "as-printed-*.safetensors"}
 REQUIRED_METADATA = ("defense", "encoding", "extractor", "serves", "shape", "slots")  # metadata for inference
 MODELS = {None: "reconstructs the photograph", "flow": "samples photographs"}  # metadata `model` -> what the network does
 STAGE_METADATA = ("start", "crops", "batch", "photographs", "rate", "symmetries")  # metadata of each training stage
@@ -187,7 +190,7 @@ def _copy_weights(fresh: GridNetwork, trained: GridNetwork, candidates: int) -> 
     old, new = trained.state_dict(), fresh.state_dict()
     if trained.shape.posteriors and not fresh.shape.posteriors:
         raise UserError("--initial-checkpoint: that network reads posteriors; pass one for raw descriptors")
-    if type(fresh) is not type(trained):  # they share all but the head
+    if type(fresh) is not type(trained) or fresh.shape.drafts != trained.shape.drafts:  # one lacks a head, or the layer of drafts
         old, new = ({name: state[name] for name in state if name in old and name in new} for state in (old, new))
     if len(fresh.shape.widths) == len(trained.shape.widths):
         old = {name: value[tuple(map(slice, new[name].shape))] if name != first else value for name, value in old.items()}

@@ -17,6 +17,7 @@ from attacks.generative import Generative
 from bench.cli import main
 from bench.codebook.examples import draw_features, write_dictionary
 from bench.codebook.public import Public
+from bench.context.drafts import Drafter
 from bench.core.errors import UserError
 from bench.extractors.sift import Sift
 from bench.images import photographs
@@ -42,11 +43,12 @@ TINY = Training(steps=4, batch=2, warmup=2)
 pytestmark = pytest.mark.usefixtures("narrow_networks")
 
 
-def build_network(seed: int = 0, length: int = 128) -> FlowNetwork:
+def build_network(seed: int = 0, length: int = 128, drafts: bool = False) -> FlowNetwork:
     """Return a network whose weights are all random, in inference."""
     torch.manual_seed(seed)
-    network = FlowNetwork(Shape(inputs=length + 2, length=length, widths=(8, 8)))
-    for weight in (*network.head.parameters(), *network.shifts.parameters()):
+    network = FlowNetwork(Shape(inputs=length + 2, length=length, widths=(8, 8), drafts=drafts))
+    first = network.read_draft.parameters() if drafts else ()
+    for weight in (*network.head.parameters(), *network.shifts.parameters(), *first):
         torch.nn.init.normal_(weight, std=0.1)
     return network.eval()
 
@@ -189,6 +191,40 @@ def test_a_dropped_release_is_ignored(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not torch.equal(predict(one), predict(other))
 
 
+def test_a_draft_is_read_and_is_dropped_with_its_release(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A prior reads no draft, in training and in sampling, bit for bit. The controls keep it."""
+    network, plain = build_network(drafts=True), encode_secret(draw_features(20))
+    photograph = draw_photographs(plain)
+    one, other = (dataclasses.replace(plain, drafts=draw_photographs(plain, seed)) for seed in (1, 2))
+
+    def predict(points: EncodedRelease) -> Tensor:
+        with torch.inference_mode():
+            output: Tensor = network(add_noise(points, photograph, [np.random.default_rng(3)]))
+        return output
+
+    def sample(points: EncodedRelease, guidance: float) -> Tensor:
+        return sample_images(network, points, 2, 3, guidance, np.random.default_rng(0))
+
+    monkeypatch.setattr(flow, "DROPPED", 1.0)
+    assert torch.equal(predict(one), predict(other))
+    monkeypatch.setattr(flow, "DROPPED", 0.0)
+    assert not torch.equal(predict(one), predict(other))
+    assert torch.equal(sample(one, 0.0), sample(other, 0.0))
+    assert not torch.equal(sample(one, 1.0), sample(other, 1.0))
+    with pytest.raises(ValueError, match="drafts"):
+        sample(plain, 1.0)
+
+
+def test_an_untrained_layer_of_drafts_changes_nothing() -> None:
+    """So a network with drafts continues the training of one without."""
+    source, points = build_network(), encode_secret(draw_features(20))
+    fresh = FlowNetwork(dataclasses.replace(source.shape, drafts=True)).eval()
+    weights.initialise_from(fresh, source, 1)
+    drafted = dataclasses.replace(points, drafts=draw_photographs(points))
+    noise = [sample_images(*pair, 1, 2, 1.0, np.random.default_rng(0)) for pair in ((source, points), (fresh, drafted))]
+    torch.testing.assert_close(*noise)
+
+
 def test_one_release_in_ten_is_dropped() -> None:
     points = encode_secret(draw_features(5))
     photograph = draw_photographs(points)
@@ -299,6 +335,32 @@ def test_hidden_positions_are_refused(tmp_path: Path) -> None:
     targets = [Target(defense=RandomLines(), supported_settings={})]
     with pytest.raises(UserError, match="--model flow: it reads points"):
         train(build_plan(targets=targets), tmp_path / "W.safetensors")
+
+
+def test_only_a_network_that_samples_photographs_reads_drafts() -> None:
+    with pytest.raises(UserError, match="only --model flow reads drafts"):
+        build_plan(model="inversion", drafts=Drafter(Asset("shipped"), Sift()))
+
+
+@pytest.mark.slow
+def test_the_attack_reads_drafts_of_the_network_of_the_training(tmp_path: Path) -> None:
+    """With another network for drafts, or none, it does not apply."""
+    extractor, raw, other, out = Sift(max_keypoints=200), *(tmp_path / f"{name}.safetensors" for name in "abc")
+    train(build_plan(model="inversion"), raw)
+    train(build_plan(model="inversion", training=dataclasses.replace(TINY, seed=1)), other)
+    drafts = Drafter(Asset(str(raw)), extractor)
+    meta = train(build_plan(drafts=drafts), out)
+    assert meta["drafts"] == {"none": weights.load(raw).digest}
+    assert train(build_plan(drafts=drafts), out)["validation"] == meta["validation"]  # finished
+    with pytest.raises(UserError, match="other drafts"):
+        train(build_plan(), out)
+    attack = Generative(weights=Asset(str(out)), drafts=Asset(str(raw)), steps=2)
+    check_attack(attack, Undefended(), extractor, draw_features(20))
+    wrong = dataclasses.replace(attack, drafts=Asset(str(other)))
+    assert "generative:drafts=FILE" in explain(wrong, Undefended(), extractor)
+    assert "generative:drafts=FILE" in explain(dataclasses.replace(attack, drafts=Asset("shipped")), Undefended(), extractor)
+    with pytest.raises(UserError, match="no network makes drafts for ldp"):
+        drafts.digest(LDP(), Public())
 
 
 # ---- the attack

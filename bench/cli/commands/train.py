@@ -48,6 +48,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "(default: %(default)s)",
     )
     parser.add_argument(
+        "--drafts",
+        metavar="FILE",
+        help="with --model flow: the network also reads the reconstructions of this network, trained for the same releases; "
+        "shipped: of those that dia uses (default: none)",
+    )
+    parser.add_argument(
         "--profile",
         choices=("cpu", "paper"),
         default="cpu",
@@ -78,6 +84,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(args: argparse.Namespace) -> int:
+    from bench.context.drafts import Drafter
     from bench.images.photographs import list_photographs, split_validation
     from bench.inversion import network_cache
     from bench.inversion.data import Target
@@ -95,15 +102,17 @@ def execute(args: argparse.Namespace) -> int:
     photographs, validation = split_validation(list_photographs(args.images), args.validation)
     profile = PROFILES[args.profile]
     overrides = {name: value for name in ("steps", "batch", "rate", "seed") if (value := getattr(args, name)) is not None}
+    extractor = spec.read(args.extractor, discovery.EXTRACTOR)
     plan = Plan(
         targets=targets,
         photographs=photographs,
         validation=validation,
-        extractor=spec.read(args.extractor, discovery.EXTRACTOR),
+        extractor=extractor,
         crossfit=[Asset(file) for file in args.crossfit],
         initial_checkpoint=args.initial_checkpoint,
         encoding=args.encoding,
         model=args.model,
+        drafts=None if args.drafts is None else Drafter(Asset(args.drafts), extractor),
         widths=args.widths or profile.widths,
         training=dataclasses.replace(profile.training, **overrides),
         keypoints=args.keypoints,
