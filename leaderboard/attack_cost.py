@@ -11,6 +11,7 @@ from typing import Any
 
 from bench.codebook.public import ASSETS
 from bench.context import weights as context
+from bench.formats import tensor_file
 from bench.inversion import weights as inversion
 from bench.positions import neighbour_model
 from bench.runner.records import Record
@@ -36,14 +37,8 @@ def count_training_samples(attack: Mapping[str, Any]) -> int | None:
 @functools.cache
 def _read_shipped() -> dict[str, tuple[str, dict[str, Any]]]:
     """Return kind and metadata of each shipped file by its digest."""
-    from safetensors import safe_open
-
-    files = {}
-    for path in ASSETS.glob("*.safetensors"):
-        with safe_open(path, framework="numpy") as opened:
-            header = opened.metadata()
-        files[header["digest"]] = header["kind"], json.loads(header["meta"])
-    return files
+    headers = map(tensor_file.read_header, ASSETS.glob("*.safetensors"))
+    return {digest: (kind, json.loads(meta)) for kind, meta, digest in headers}
 
 
 def measure_core_seconds(records: Iterable[Record]) -> float | None:

@@ -14,7 +14,7 @@ Both leakages are lower bounds. A stronger attack on the defense can refute "les
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 from leaderboard.comparison import ComparisonGroup, GroupedExperiment
@@ -131,35 +131,34 @@ def find_control(group: ComparisonGroup, groups: Sequence[ComparisonGroup], resu
             noises.setdefault(one.defense, []).append(one)
     if defense["name"] == CONTROL:
         return None
-    for utility in list_measures(UTILITY):
-        for served in groups:
-            if utility not in served.measures or list_shared_settings(served) != list_shared_settings(group):
-                continue
-            own = _average_utility(served, utility, defense)
-            others = {
-                label: score
-                for label, each in noises.items()
-                if (score := _average_utility(served, utility, each[0].metadata["defense"])) is not None
-            }
-            if own is None or not others:
-                continue
-            label = min(others, key=lambda label: abs(others[label] - own))
-            if abs(others[label] - own) <= TOLERANCE:
-                utilities = own, others[label]
-                return Control(label=label, utility=utility, utilities=utilities, experiments=tuple(noises[label]))
+    for utility in _list_utilities(group, groups, defense):
+        others = {
+            label: score
+            for label, each in noises.items()
+            if (score := _average_utility(utility.group, utility.measure, each[0].metadata["defense"])) is not None
+        }
+        label = min(others, key=lambda label: abs(others[label] - utility.mean), default=None)
+        if label is not None and abs(others[label] - utility.mean) <= TOLERANCE:
+            utilities = utility.mean, others[label]
+            return Control(label=label, utility=utility.measure, utilities=utilities, experiments=tuple(noises[label]))
     return None
 
 
 def find_utility(group: ComparisonGroup, groups: Sequence[ComparisonGroup], defense: dict[str, object]) -> Utility | None:
     """Return the utility of a defense of the group from `groups` of the same features, on the same dataset if it was measured."""
+    return next(_list_utilities(group, groups, defense), None)
+
+
+def _list_utilities(group: ComparisonGroup, groups: Sequence[ComparisonGroup], defense: dict[str, object]) -> Iterator[Utility]:
+    """Yield the utilities of a defense from groups of the same features, by measure, first on the dataset of `group`."""
     content = group.metadata["dataset"]["hash"]
+    alike = [one for one in groups if list_shared_settings(one) == list_shared_settings(group)]
+    alike.sort(key=lambda one: one.metadata["dataset"]["hash"] != content)
     for measure in list_measures(UTILITY):
-        for served in sorted(groups, key=lambda one: one.metadata["dataset"]["hash"] != content):
-            if measure in served.measures and list_shared_settings(served) == list_shared_settings(group):
-                mean = _average_utility(served, measure, defense)
-                if mean is not None:
-                    return Utility(measure=measure, mean=mean, group=served)
-    return None
+        for served in alike:
+            mean = _average_utility(served, measure, defense) if measure in served.measures else None
+            if mean is not None:
+                yield Utility(measure=measure, mean=mean, group=served)
 
 
 def _average_utility(group: ComparisonGroup, utility: Measure, defense: dict[str, object]) -> float | None:

@@ -16,6 +16,7 @@ from typing import Any
 from bench.codebook.public import ASSETS
 from bench.core.environment import DISTRIBUTION
 from bench.core.table import markdown_row
+from bench.formats import tensor_file
 
 HEADING = "## Provenance"
 CHUNK = "Provenance"
@@ -28,13 +29,7 @@ def read_digests(folder: Path = ASSETS) -> dict[str, str]:
 
     `bench.formats.tensor_file` verifies it at every load.
     """
-    from safetensors import safe_open
-
-    digests = {}
-    for path in sorted(folder.glob("*.safetensors")):
-        with safe_open(path, framework="numpy") as opened:
-            digests[path.name] = opened.metadata()["digest"]
-    return digests
+    return {path.name: tensor_file.read_header(path)[2] for path in sorted(folder.glob("*.safetensors"))}
 
 
 def list_shipped_files(configurations: Iterable[Mapping[str, Any]]) -> dict[str, str]:

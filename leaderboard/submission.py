@@ -21,6 +21,7 @@ from bench.codebook.public import ASSETS, CLUSTERED, REFERENCES, SHIPPED
 from bench.core import strict_json
 from bench.core.errors import SampleError, UserError
 from bench.core.progress import Progress
+from bench.formats import tensor_file
 from bench.images.photographs import list_photographs
 from bench.images.samples import Images
 from bench.registry import discovery, fields, spec
@@ -152,9 +153,11 @@ class _LocalInputs:
 
     def __init__(self, images: Path | None, files: Sequence[Path]) -> None:
         self.images = None if images is None else list_photographs(images)
-        shipped = {Asset(name): _read_digest(ASSETS / file) for name, file in SHIPPED.items() if (ASSETS / file).is_file()}
+        shipped = {
+            Asset(name): tensor_file.read_header(ASSETS / file)[2] for name, file in SHIPPED.items() if (ASSETS / file).is_file()
+        }
         clustered = {Asset(name): name_digest(shipped[Asset(source)]) for name, source in CLUSTERED.items() if source in shipped}
-        own = {Asset(file): _read_digest(file) for file in files}
+        own = {Asset(file): tensor_file.read_header(file)[2] for file in files}
         self.assets = {digest: name for name, digest in (shipped | clustered | own).items()}  # digest -> value of a field
 
     def photographs(self, record: Record) -> Images:
@@ -320,23 +323,6 @@ def _compare(line: NumberedRecord, repeated: Record | None) -> Iterator[Fault]:
 
 def _format_number(value: float | None) -> str:
     return "missing" if value is None else f"{value:.6g}"
-
-
-def _read_digest(path: Path) -> str:
-    """Return the digest by which records name a file, from its header.
-
-    Raises
-    ------
-    UserError
-        if it is not a safetensors file of this program.
-    """
-    from safetensors import SafetensorError, safe_open
-
-    try:
-        with safe_open(path, framework="numpy") as opened:
-            return str((opened.metadata() or {})["digest"])
-    except (OSError, SafetensorError, KeyError) as error:
-        raise UserError(f"--file {path}: not a dictionary or network of this program ({error})") from None
 
 
 def format_faults(faults: Iterable[Fault]) -> Iterator[str]:

@@ -77,18 +77,14 @@ class _Judgement:
     noise: Mapping[WorstCase, NoiseComparison]
 
 
-def build_defense_table(group: ComparisonGroup, groups: Sequence[ComparisonGroup] = ()) -> Table | None:
-    """Return a table with a row for each defense and suite; None if there are no results. `groups` may hold the utilities."""
-    return _build_defenses(_judge(group, list_results(group), groups), groups)
+def build_group_tables(
+    group: ComparisonGroup, groups: Sequence[ComparisonGroup] = (), *, brief: bool = False
+) -> dict[str, Table]:
+    """Return the table `defenses` with a row for each defense, and `worst-case` with one for each measure. {} without results.
 
-
-def build_suite_table(group: ComparisonGroup, groups: Sequence[ComparisonGroup] = (), *, brief: bool = False) -> Table | None:
-    """Return the table of all defenses with results under a suite of attacks; None if there are none.
-
-    `groups` may hold the utilities of the defenses, for the matched-noise control. A `brief` table has the measures that rank
-    defenses alone.
+    `groups` may hold the utilities of the defenses. A `brief` table of worst cases has the measures that rank defenses alone.
     """
-    return _build_worst_cases(_judge(group, list_results(group), groups), brief)
+    return _build_tables(group, list_results(group), groups, brief)
 
 
 def build_run_tables(records: Sequence[Record], *, brief: bool = False) -> list[Table]:
@@ -98,9 +94,17 @@ def build_run_tables(records: Sequence[Record], *, brief: bool = False) -> list[
     """
     groups = build_groups([LocatedRecord(record, Path()) for record in records])
     results = [(group, list_results(group)) for group in groups]
-    judgements = [_judge(group, each, groups) for group, each in results if any(one.is_complete_run for one in each)]
-    tables = [table for one in judgements for table in (_build_defenses(one, groups), _build_worst_cases(one, brief))]
-    return [table for table in tables if table]
+    complete = [(group, each) for group, each in results if any(one.is_complete_run for one in each)]
+    return [table for group, each in complete for table in _build_tables(group, each, groups, brief).values()]
+
+
+def _build_tables(
+    group: ComparisonGroup, every: Sequence[SuiteResult], groups: Sequence[ComparisonGroup], brief: bool
+) -> dict[str, Table]:
+    judgement = _judge(group, every, groups)
+    if not judgement.results:
+        return {}
+    return {"defenses": _build_defenses(judgement, groups), "worst-case": _build_worst_cases(judgement, brief)}
 
 
 def _judge(group: ComparisonGroup, every: Sequence[SuiteResult], groups: Sequence[ComparisonGroup]) -> _Judgement:
@@ -117,9 +121,7 @@ def _judge(group: ComparisonGroup, every: Sequence[SuiteResult], groups: Sequenc
     )
 
 
-def _build_defenses(judgement: _Judgement, groups: Sequence[ComparisonGroup]) -> Table | None:
-    if not judgement.results:
-        return None
+def _build_defenses(judgement: _Judgement, groups: Sequence[ComparisonGroup]) -> Table:
     utilities = {
         result: utility
         for result in judgement.results
@@ -255,9 +257,7 @@ def _name_suite(result: SuiteResult) -> str:
     return result.version or f"{INCOMPLETE}: {result.suite}"
 
 
-def _build_worst_cases(judgement: _Judgement, brief: bool) -> Table | None:
-    if not judgement.results:
-        return None
+def _build_worst_cases(judgement: _Judgement, brief: bool) -> Table:
     labels = (*_LABELS[:-1], _NOISE, *_LABELS[-1:]) if judgement.noise else _LABELS
     return Table(
         heading=f"Worst case over a suite of attacks. {', '.join([judgement.group.title, *judgement.group.facts])}",

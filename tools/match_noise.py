@@ -28,7 +28,7 @@ from bench.tasks.matching import Matching
 from defenses.noise import Noise
 from leaderboard.comparison import LocatedRecord, build_groups
 from leaderboard.noise_control import TOLERANCE
-from leaderboard.suite_table import build_suite_table
+from leaderboard.suite_table import build_group_tables
 
 TITLE = """# Matched-noise control
 
@@ -160,7 +160,8 @@ def find_sigma(target: Utility, match: Callable[[float], Utility]) -> Match:
 def format_page(matches: Mapping[str, Match | str], records: Sequence[Record], adapted: bool) -> str:
     """Return the page: the noise of each defense, and the worst cases by the measures that rank defenses."""
     groups = build_groups([LocatedRecord(record, Path()) for record in records])
-    tables = [table for group in groups if group.has_attacks and (table := build_suite_table(group, groups, brief=True))]
+    built = [build_group_tables(group, groups, brief=True) for group in groups if group.has_attacks]
+    tables = [tables["worst-case"] for tables in built if tables]
     title = TITLE.format(adapted=ADAPTED if adapted else UNADAPTED)
     return "\n".join([title, *format_matches(matches), "", *(to_markdown(table) for table in tables)])
 

@@ -80,6 +80,17 @@ def load(path: Path, kind: str) -> tuple[Arrays, dict[str, Any], str]:
     return arrays, *_check_digest(path, arrays, header)
 
 
+def read_header(path: Path) -> tuple[str, str, str]:
+    """Return the kind, the metadata as JSON, and the digest as they are written, without the arrays. Nothing is verified.
+
+    Raises
+    ------
+    UserError
+        if there is no such file, or it is no safetensors file of this program.
+    """
+    return _get_fields(path, _read(path, with_arrays=False)[1])
+
+
 def verify(path: Path) -> None:
     """Check the digest of a file of any kind.
 
@@ -92,14 +103,14 @@ def verify(path: Path) -> None:
     _check_digest(path, arrays, header)
 
 
-def _read(path: Path) -> tuple[Arrays, dict[str, str]]:
+def _read(path: Path, *, with_arrays: bool = True) -> tuple[Arrays, dict[str, str]]:
     from safetensors import SafetensorError, safe_open
 
     if not path.is_file():
         raise UserError(f"{path}: no such file")
     try:
         with safe_open(path, framework="numpy") as opened:
-            names, header = list(opened.keys()), opened.metadata() or {}
+            names, header = list(opened.keys()) if with_arrays else [], opened.metadata() or {}
             for name in names:
                 if (dtype := opened.get_slice(name).get_dtype()) not in DTYPES:
                     raise UserError(f"{path}: tensor {name} has the type {dtype}, which NumPy does not know")
@@ -110,15 +121,21 @@ def _read(path: Path) -> tuple[Arrays, dict[str, str]]:
 
 def _check_digest(path: Path, arrays: Arrays, header: dict[str, str]) -> tuple[dict[str, Any], str]:
     """Return the metadata and the digest."""
-    if not {"kind", "digest", "meta"} <= header.keys():
-        raise UserError(f"{path}: has no checksum, so this program did not write it")
+    kind, text, written = _get_fields(path, header)
     try:
-        meta = strict_json.parse(header["meta"])
+        meta = strict_json.parse(text)
     except ValueError as error:
         raise UserError(f"{path}: its metadata are damaged: {error}") from None
     if not isinstance(meta, dict):
         raise UserError(f"{path}: its metadata are not a JSON object, so this program did not write it")
-    digest = hash_content(header["kind"], arrays, meta)
-    if digest != header.get("digest"):
-        raise UserError(f"{path}: its checksum is {digest}, but {header.get('digest')} was written; fetch or build it again")
+    digest = hash_content(kind, arrays, meta)
+    if digest != written:
+        raise UserError(f"{path}: its checksum is {digest}, but {written} was written; fetch or build it again")
     return meta, digest
+
+
+def _get_fields(path: Path, header: dict[str, str]) -> tuple[str, str, str]:
+    """Return the kind, the metadata and the digest of a header."""
+    if not {"kind", "digest", "meta"} <= header.keys():
+        raise UserError(f"{path}: has no checksum, so this program did not write it")
+    return header["kind"], header["meta"], header["digest"]

@@ -79,11 +79,8 @@ def _write_group(
     table = group_tables.build_pairs_table(group)
     tables: dict[str, Table] = {"pairs": table}
     tables |= {"ranking": group_tables.build_ranking_table(group)} if group.has_attacks else {}
-    suite = {
-        "defenses": suite_table.build_defense_table(group, groups),
-        "worst-case": suite_table.build_suite_table(group, groups),
-    }
-    tables |= {kind: each for kind, each in suite.items() if each}
+    suite = suite_table.build_group_tables(group, groups)
+    tables |= suite
     views = []
     for row in table.rows:
         views.append(experiments.build_view(group, table, row, tradeoffs, out, lookup))

@@ -12,7 +12,7 @@ from bench.runner import attack_suite
 from leaderboard import comparison, noise_control
 from leaderboard.comparison import ComparisonGroup
 from leaderboard.noise_control import LESS, MORE, NOT_LESS, TOLERANCE, compare_with_noise
-from leaderboard.suite_table import build_suite_table
+from leaderboard.suite_table import build_group_tables
 from leaderboard.worst_case import list_results
 
 NONE = {"name": "none"}
@@ -77,8 +77,7 @@ def test_verdict(tmp_path: Path, score: float, verdict: str) -> None:
     group, groups = build_attacked(tmp_path, score)
     assert judge(group, groups)["ldp", "ssim"] == verdict
     assert judge(group, groups)["ldp", "mae"] is None  # the score is shown, and not judged
-    table = build_suite_table(group, groups)
-    assert table
+    table = build_group_tables(group, groups)["worst-case"]
     (row,) = (row for row in table.rows if row.values["defense"].startswith("ldp") and row.values["measure"] == "ssim")
     assert row.values["noise"].mean == pytest.approx(0.4)  # of the strongest attack
     assert row.values["noise_verdict"] == verdict
@@ -124,8 +123,7 @@ def test_noise_of_another_utility_is_no_control(tmp_path: Path) -> None:
     utility = [match(ldp(10.0), 0.3), match(noise(1.0), 0.3 + 1.5 * TOLERANCE)]
     group, groups = build(tmp_path / "other", attacked, utility)
     assert judge(group, groups) == {}
-    table = build_suite_table(group, groups)
-    assert table
+    table = build_group_tables(group, groups)["worst-case"]
     assert "noise" not in {column.label for column in table.columns}
     group, groups = build(tmp_path / "none", attacked)
     assert judge(group, groups) == {}

@@ -16,7 +16,7 @@ from leaderboard import attack_cost, comparison, run_report, site
 from leaderboard.attack_flags import NOT_MONOTONE, WEAKER, flag_attacks, knows_less
 from leaderboard.comparison import ComparisonGroup
 from leaderboard.provenance import read_digests
-from leaderboard.suite_table import NOT_STATED, build_defense_table, build_run_tables, build_suite_table
+from leaderboard.suite_table import NOT_STATED, build_group_tables, build_run_tables
 from leaderboard.worst_case import SuiteResult, list_results
 
 NEWEST = attack_suite.list_attack_suites()[-1]
@@ -97,9 +97,7 @@ def test_an_attack_without_a_network_is_missing_until_one_is_trained(tmp_path: P
 
 
 def find_row(group: ComparisonGroup, groups: Sequence[ComparisonGroup] = ()) -> Row:
-    table = build_defense_table(group, groups)
-    assert table
-    (row,) = table.rows
+    (row,) = build_group_tables(group, groups)["defenses"].rows
     return row
 
 
@@ -164,9 +162,7 @@ def test_the_setting_nearest_to_the_fixed_recall_is_marked(tmp_path: Path) -> No
     def list_utilities(folder: str, *epsilons: float) -> list[str]:
         records = [one for epsilon in epsilons for one in (*attacked[epsilon], *served[epsilon])]
         groups = comparison.build_groups(comparison.load_records(fabricated.write(tmp_path / folder, records)))
-        table = build_defense_table(groups[0], groups)
-        assert table
-        return [row.texts[4] for row in table.rows]
+        return [row.texts[4] for row in build_group_tables(groups[0], groups)["defenses"].rows]
 
     texts = [f"recall (0.25 m, 2°) {recall} on gallery" for recall in ("0.2", "0.6", "1")]
     assert list_utilities("several", *hits) == [texts[0], f"{texts[1]}, nearest to 0.5", texts[2]]
@@ -206,8 +202,7 @@ def test_an_attack_that_reached_its_budget_is_flagged(tmp_path: Path) -> None:
 
 
 def list_flags_by_measure(group: ComparisonGroup) -> dict[str, str]:
-    table = build_suite_table(group)
-    assert table
+    table = build_group_tables(group)["worst-case"]
     return {row.values["measure"]: row.values["flags"] for row in table.rows}
 
 
@@ -278,8 +273,7 @@ def test_defenses_that_differ_in_more_than_epsilon_are_not_compared(tmp_path: Pa
 
 
 def test_table_shows_version_attack_baselines_and_flags(tmp_path: Path) -> None:
-    table = build_suite_table(build_group(tmp_path, run_suite({**SCORES, "repeat": 0.3})))
-    assert table
+    table = build_group_tables(build_group(tmp_path, run_suite({**SCORES, "repeat": 0.3})))["worst-case"]
     (row,) = (row for row in table.rows if row.values["measure"] == "ssim")
     assert [row.values[name] for name in ("suite", "attack", "signal")] == [STANDARD, "dia", "yes"]
     assert row.values["flags"] == f"{WEAKER}: repeat:releases=2 than dia"
@@ -298,8 +292,7 @@ def test_a_run_of_the_newest_version_has_the_older_one_too(tmp_path: Path, monke
 
 def test_table_of_an_incomplete_run_lists_what_is_missing(tmp_path: Path) -> None:
     records = run_suite(without=["lattice"])
-    table = build_suite_table(build_group(tmp_path, records))
-    assert table
+    table = build_group_tables(build_group(tmp_path, records))["worst-case"]
     assert {row.values["suite"] for row in table.rows} == {f"incomplete: {STANDARD}"}
     assert {row.note for row in table.rows} == {"missing: lattice:longest=520 (not run)"}
     assert build_run_tables(records) == []  # the report of a run of single attacks is as before
