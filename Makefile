@@ -64,6 +64,7 @@ docs: .venv/ready-for-docs # the site, in build/site: open index.html from the d
 assets: .venv/ready # hours: rebuilds the dictionaries and networks that are shipped
 	$(BIN)/python tools/make_assets.py --data $(DATA) --work work/assets
 	$(BIN)/python tools/train_word_attackers.py --data $(DATA) --work work/assets
+	$(BIN)/python tools/make_assets.py --data $(DATA) --work work/assets --samplers
 
 .venv/ready: pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.11")'

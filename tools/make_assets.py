@@ -4,7 +4,8 @@ The photographs of `train/` that are in neither list are split by name into thre
 first two thirds, the attacker's public database from the last. A network that reads releases is trained on photographs that its
 dictionary was not built from: those of the last third, or all with a second dictionary that is built from the last third. Most
 networks start from one that was trained on raw upright descriptors of all photographs. `train_word_attackers.py` trains the
-attackers of word sets of upright SIFT afterwards.
+attackers of word sets of upright SIFT afterwards. Then this program with `--samplers` trains the networks that sample
+photographs, since they read the reconstructions of the others.
 """
 
 from __future__ import annotations
@@ -109,6 +110,16 @@ TRAININGS = (
     ),
     Training(file="line-inversion", defenses=("lines", "permutation"), steps=3000, widths=NARROW),
 )
+SAMPLERS = (
+    Training(
+        file="flow-sift",
+        defenses=("none", "ldp"),
+        steps=9000,
+        photographs="2",
+        widths=NARROW,
+        options=("--model", "flow", "--drafts", "shipped"),
+    ),
+)
 
 
 def main() -> None:
@@ -116,8 +127,13 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--work", type=Path, required=True, help="folder of finished files, reused between runs")
     parser.add_argument("--fraction", type=float, default=1.0, help="of the steps of each training, for a test")
+    parser.add_argument("--samplers", action="store_true", help="train the networks that sample photographs, after all others")
     args = parser.parse_args()
     folders = split_photographs(args.data, args.work / "photographs")
+    if args.samplers:
+        for training in SAMPLERS:
+            ship(train(training, folders, args.work, args.fraction))
+        return
     for file, photographs, words, extractor in (*DICTIONARIES, CROSSFIT):
         build = "dictionary", "build", "--images", folders[photographs], "--size", words, "--extractor", extractor
         run_once(args.work / f"{file}.safetensors", *build)
