@@ -86,7 +86,7 @@ class Generative(ImageAttack):
         settings, module = network.encode_settings(view.defense, public), network.module
         assert isinstance(module, FlowNetwork)  # by the metadata
         points = encode([view.release], [settings], network.meta["slots"], network.meta["encoding"])
-        if module.shape.drafts:
+        if network.meta.get("drafts") is not None:
             points = replace(points, drafts=self._draft(view, public))
         images = sample_images(module, points, self.samples, self.steps, self.guidance, rng)
         return images.permute(0, 2, 3, 1).cpu().numpy()

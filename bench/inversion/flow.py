@@ -12,10 +12,11 @@ the network learns the mean of the velocity, photograph - noise, given x_t, t an
 follows the velocity to t = 1. With probability `DROPPED` a training sample has no release. So the same network also learns the
 velocity of the prior, u. With guidance w, a sample follows u + w (v - u): w = 0 gives the prior, w = 1 the posterior.
 
-The network is the inversion network up to the features of each cell. Its input also has x_t, and t shifts the levels. With
-`drafts`, it has the coefficients of another network's reconstruction too, which is lost together with the release. If cells
-were independent Gaussians, the velocity would be (2t - 1) / D x_t, with D = (1 - t)² + t². The head predicts the rest, which
-has variance 1 / D.
+The network is the inversion network up to the features of each cell. Its input also has x_t, and t shifts the levels. A draft,
+which is another network's reconstruction, can be part of it too, and is lost together with the release. The head predicts the
+photograph minus the draft. The velocity is then (prediction - x_t) / (1 - t). So the noise that the photograph lacks needs no
+weights to be removed, and an untrained network returns the draft. Prediction of the photograph and loss of the velocity: Li and
+He, Back to Basics: Let Denoising Generative Models Denoise (2025).
 
 The path and the solver are ten lines, so no library is used. torchcfm has this path, and couplings of noise and photographs,
 which do not apply if each photograph has its own release. Schedulers of diffusers expect its models. torchdiffeq adapts its
@@ -44,6 +45,7 @@ SHIFT = 3.0  # of the times in training and of the solver (`warp_time`)
 FREQUENCIES = 6  # of the embedding of t
 TIME_WIDTH = 64  # of the embedding of t
 WIDTH = 64  # channels of the head
+MIN_REST = 0.05  # least 1 - t by which a velocity is divided
 
 Velocity = Callable[[Tensor, float], Tensor]  # x_t, t -> velocity
 
@@ -59,15 +61,12 @@ class FlowNetwork(GridNetwork):
         first = shape.widths[0]
         self.register_buffer("mean", torch.zeros(CHANNELS, 1, 1))
         self.register_buffer("spread", torch.ones(CHANNELS, 1, 1))
-        self.read = nn.Conv2d(CHANNELS, self.channels, 1)
-        if shape.drafts:
-            self.read_draft = nn.Conv2d(CHANNELS, self.channels, 3, padding=1, bias=False)
-            nn.init.zeros_(self.read_draft.weight)  # untrained: as without drafts
+        self.read = nn.Conv2d(2 * CHANNELS, self.channels, 1)
         self.time = nn.Sequential(nn.Linear(2 * FREQUENCIES, TIME_WIDTH), nn.SiLU())
         self.shifts = nn.ModuleList(nn.Linear(TIME_WIDTH, width) for width in shape.widths)
         last = nn.Conv2d(WIDTH, CHANNELS, 3, padding=1)
-        self.head = nn.Sequential(nn.Conv2d(first + CHANNELS, WIDTH, 3, padding=1), nn.SiLU(), last)
-        for weight in (*last.parameters(), *self.shifts.parameters()):  # untrained: the velocity of independent Gaussians
+        self.head = nn.Sequential(nn.Conv2d(first + 2 * CHANNELS, WIDTH, 3, padding=1), nn.SiLU(), last)
+        for weight in (*last.parameters(), *self.shifts.parameters()):  # untrained: the draft
             nn.init.zeros_(weight)
 
     def forward(self, batch: NoisyRelease) -> Tensor:
@@ -79,29 +78,30 @@ class FlowNetwork(GridNetwork):
         photographs = self.to_cells(batch.photographs)
         time = batch.time[:, None, None, None]
         noisy = (1 - time) * batch.noise + time * photographs
-        error = self.predict(self.build_condition(batch), noisy, batch.time) - (photographs - batch.noise)
+        target = (photographs - noisy) / (1 - time).clamp(min=MIN_REST)  # the velocity, but at the end of the path
+        error = self.predict(self.build_condition(batch), noisy, batch.time) - target
         return error * (self.spread / self.spread.mean()).sqrt()
 
     def build_condition(self, points: EncodedRelease) -> Tensor:
         """Return what the network reads of releases and their drafts, zero without a release. -> (B, C, H/4, W/4)"""
-        condition = self.scatter(points)
-        if not self.shape.drafts:
-            return condition
+        cells = self.scatter(points)
         if points.drafts is None:
-            raise ValueError("the network reads drafts, and there are none")
-        drafts = self.read_draft(self.to_cells(points.drafts))
-        return condition + (drafts if points.drafted is None else drafts * points.drafted[:, None, None, None])
+            drafts = cells.new_zeros(points.batch, CHANNELS, *points.grid)
+        else:
+            drafts = self.to_cells(points.drafts)
+            drafts = drafts if points.drafted is None else drafts * points.drafted[:, None, None, None]
+        return torch.cat([cells, drafts], dim=1)
 
     def predict(self, condition: Tensor, noisy: Tensor, time: Tensor) -> Tensor:
         """Return the velocity. (B, C, H/4, W/4) from `build_condition`, (B, 48, H/4, W/4), (B,) -> (B, 48, H/4, W/4)"""
         rows, columns = noisy.shape[2:]
+        cells, draft = condition.split((self.channels, CHANNELS), dim=1)
         embedded = self.time(embed_time(time))
         shifts = [shift(embedded)[:, :, None, None] for shift in self.shifts]
-        features = self.refine_grid(condition + self.read(noisy), shifts)[:, :, :rows, :columns]
-        rest = self.head(torch.cat([features, noisy.to(features.dtype)], dim=1)).float()
-        time = time[:, None, None, None]
-        variance = (1 - time) ** 2 + time**2
-        return (2 * time - 1) / variance * noisy + rest / variance.sqrt()
+        images = torch.cat([noisy, draft], dim=1)
+        features = self.refine_grid(cells + self.read(images), shifts)[:, :, :rows, :columns]
+        photograph = draft + self.head(torch.cat([features, images.to(features.dtype)], dim=1)).float()
+        return (photograph - noisy) / (1 - time).clamp(min=MIN_REST)[:, None, None, None]
 
     def to_cells(self, images: Tensor) -> Tensor:
         """Return the scaled coefficients of images; incomplete cells repeat the border. (B, 3, H, W) -> (B, 48, H/4, W/4)"""
@@ -210,9 +210,13 @@ def guide(module: FlowNetwork, condition: Tensor, guidance: float) -> Velocity:
 
 
 def solve(velocity: Velocity, start: Tensor, times: Sequence[float]) -> Tensor:
-    """Integrate a velocity from the first to the last time by Heun's method, of second order."""
+    """Integrate a velocity from the first to the last time by Heun's method, of second order.
+
+    The last step is Euler's, since a velocity may be undefined at the last time.
+    """
     x = start
     for time, after in itertools.pairwise(times):
         slope = velocity(x, time)
-        x = x + (after - time) / 2 * (slope + velocity(x + (after - time) * slope, after))
+        ahead = x + (after - time) * slope
+        x = ahead if after == times[-1] else x + (after - time) / 2 * (slope + velocity(ahead, after))
     return x

@@ -36,7 +36,6 @@ class Shape:
     last: int = 32  # channels at 1/2
     patch: int = 6  # cells: the side of the patch around a keypoint
     painted: int = 16  # channels of the patch; the name is part of the file format
-    drafts: bool = False  # whether a network that samples photographs reads drafts (`bench.inversion.flow`)
     samples: int = 0  # points on each line of a network that reads lines (`bench.inversion.line_network`); 0: it reads points
 
 

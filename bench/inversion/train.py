@@ -102,14 +102,7 @@ def train_worker(group: ProcessGroup, plan: Plan, out: Path, log: Path | None) -
     drafts = plan.drafts and {target.defense.name(): plan.drafts.digest(target.defense, Public()) for target in targets}
     sample, _ = build_batch([first], slots, encoding, samples)
     candidates = slots if encoding == "invariant" and sets else 0
-    shape = Shape(
-        inputs=sample.values.shape[1],
-        candidates=candidates,
-        length=length,
-        widths=plan.widths,
-        drafts=plan.drafts is not None,
-        samples=samples,
-    )
+    shape = Shape(inputs=sample.values.shape[1], candidates=candidates, length=length, widths=plan.widths, samples=samples)
     initial = None if plan.initial_checkpoint is None else weights.load(plan.initial_checkpoint)
     meta = {
         **weights.describe(targets, extractor, Public(), plan.keypoints),

@@ -190,7 +190,7 @@ def _copy_weights(fresh: GridNetwork, trained: GridNetwork, candidates: int) -> 
     old, new = trained.state_dict(), fresh.state_dict()
     if trained.shape.posteriors and not fresh.shape.posteriors:
         raise UserError("--initial-checkpoint: that network reads posteriors; pass one for raw descriptors")
-    if type(fresh) is not type(trained) or fresh.shape.drafts != trained.shape.drafts:  # one lacks a head, or the layer of drafts
+    if type(fresh) is not type(trained):  # they share all but the head
         old, new = ({name: state[name] for name in state if name in old and name in new} for state in (old, new))
     if len(fresh.shape.widths) == len(trained.shape.widths):
         old = {name: value[tuple(map(slice, new[name].shape))] if name != first else value for name, value in old.items()}

@@ -43,12 +43,11 @@ TINY = Training(steps=4, batch=2, warmup=2)
 pytestmark = pytest.mark.usefixtures("narrow_networks")
 
 
-def build_network(seed: int = 0, length: int = 128, drafts: bool = False) -> FlowNetwork:
+def build_network(seed: int = 0, length: int = 128) -> FlowNetwork:
     """Return a network whose weights are all random, in inference."""
     torch.manual_seed(seed)
-    network = FlowNetwork(Shape(inputs=length + 2, length=length, widths=(8, 8), drafts=drafts))
-    first = network.read_draft.parameters() if drafts else ()
-    for weight in (*network.head.parameters(), *network.shifts.parameters(), *first):
+    network = FlowNetwork(Shape(inputs=length + 2, length=length, widths=(8, 8)))
+    for weight in (*network.head.parameters(), *network.shifts.parameters()):
         torch.nn.init.normal_(weight, std=0.1)
     return network.eval()
 
@@ -78,7 +77,7 @@ def gaussian_velocity(x: Tensor, time: float) -> Tensor:
 def test_the_exact_velocity_transports_noise_to_gaussian_photographs() -> None:
     """Its solution is MEAN + SPREAD noise. Control: half the velocity ends elsewhere."""
     noise = torch.linspace(-2, 2, 9, dtype=torch.float64)
-    times = [warp_time(step / 400) for step in range(401)]
+    times = [warp_time(step / 1000) for step in range(1001)]
     torch.testing.assert_close(solve(gaussian_velocity, noise, times), MEAN + SPREAD * noise, atol=1e-4, rtol=0)
     other = solve(lambda x, time: gaussian_velocity(x, time) / 2, noise, times)
     assert (other - MEAN - SPREAD * noise).abs().max() > 0.1
@@ -112,15 +111,17 @@ def test_the_mean_velocity_of_training_is_the_exact_velocity(rng: np.random.Gene
         assert slope == pytest.approx(float(expected[1] - expected[0]), abs=0.02)
 
 
-def test_an_untrained_network_transports_noise_to_independent_gaussians(rng: np.random.Generator) -> None:
-    """Cells then have the mean and the spread of the coefficients: the solution of the velocity is the noise itself."""
+def test_an_untrained_network_returns_the_draft(rng: np.random.Generator) -> None:
+    """And without a draft, the mean photograph."""
     network = FlowNetwork(Shape(inputs=130, length=128, widths=(8, 8))).eval()
+    network.measure_coefficients([rng.integers(256, size=(32, 40, 3), dtype=np.uint8)])
     points = encode_secret(draw_features(5))
-    noise = torch.from_numpy(rng.standard_normal((1, 48, *points.grid), np.float32))
-    with torch.inference_mode():
-        velocity = flow.guide(network, network.scatter(points), 1.0)
-        end = solve(velocity, noise, [warp_time(step / 20) for step in range(21)])
-    torch.testing.assert_close(end, noise, atol=2e-2, rtol=0)
+    draft = draw_photographs(points)
+    drafted = dataclasses.replace(points, drafts=draft)
+    torch.testing.assert_close(sample_images(network, drafted, 1, 3, 1.0, rng), draft, atol=2e-2, rtol=0)
+    mean = network.to_images(torch.zeros(1, 48, *points.grid), points.size)
+    for given, guidance in ((points, 1.0), (drafted, 0.0)):
+        torch.testing.assert_close(sample_images(network, given, 1, 3, guidance, rng), mean, atol=2e-2, rtol=0)
 
 
 def test_cells_are_an_orthonormal_transform_of_pixels(rng: np.random.Generator) -> None:
@@ -159,7 +160,7 @@ def test_guidance_one_is_the_conditional_sample_and_zero_the_prior() -> None:
 
     noise = torch.from_numpy(np.random.default_rng(0).standard_normal((2, 48, *points.grid), np.float32))
     with torch.inference_mode(), flow.autocast(network):
-        condition = network.scatter(points)
+        condition = network.build_condition(points)
 
         def plain(x: Tensor, time: float) -> Tensor:
             return network.predict(condition.expand(2, -1, -1, -1), x, torch.full((2,), time))
@@ -186,14 +187,14 @@ def test_a_dropped_release_is_ignored(monkeypatch: pytest.MonkeyPatch) -> None:
     assert torch.equal(predict(one), predict(other))
     batch = add_noise(one, photograph, [np.random.default_rng(3)])
     with torch.inference_mode():
-        assert not network.scatter(batch).any()
+        assert not network.build_condition(batch).any()
     monkeypatch.setattr(flow, "DROPPED", 0.0)
     assert not torch.equal(predict(one), predict(other))
 
 
 def test_a_draft_is_read_and_is_dropped_with_its_release(monkeypatch: pytest.MonkeyPatch) -> None:
     """A prior reads no draft, in training and in sampling, bit for bit. The controls keep it."""
-    network, plain = build_network(drafts=True), encode_secret(draw_features(20))
+    network, plain = build_network(), encode_secret(draw_features(20))
     photograph = draw_photographs(plain)
     one, other = (dataclasses.replace(plain, drafts=draw_photographs(plain, seed)) for seed in (1, 2))
 
@@ -211,18 +212,6 @@ def test_a_draft_is_read_and_is_dropped_with_its_release(monkeypatch: pytest.Mon
     assert not torch.equal(predict(one), predict(other))
     assert torch.equal(sample(one, 0.0), sample(other, 0.0))
     assert not torch.equal(sample(one, 1.0), sample(other, 1.0))
-    with pytest.raises(ValueError, match="drafts"):
-        sample(plain, 1.0)
-
-
-def test_an_untrained_layer_of_drafts_changes_nothing() -> None:
-    """So a network with drafts continues the training of one without."""
-    source, points = build_network(), encode_secret(draw_features(20))
-    fresh = FlowNetwork(dataclasses.replace(source.shape, drafts=True)).eval()
-    weights.initialise_from(fresh, source, 1)
-    drafted = dataclasses.replace(points, drafts=draw_photographs(points))
-    noise = [sample_images(*pair, 1, 2, 1.0, np.random.default_rng(0)) for pair in ((source, points), (fresh, drafted))]
-    torch.testing.assert_close(*noise)
 
 
 def test_one_release_in_ten_is_dropped() -> None:
