@@ -113,11 +113,11 @@ TRAININGS = (
 SAMPLERS = (
     Training(
         file="flow-sift",
-        defenses=("none", "ldp"),
-        steps=9000,
+        defenses=("none", "affine", "ldp"),
+        steps=3600,
         photographs="2",
         widths=NARROW,
-        options=("--model", "flow", "--drafts", "shipped"),
+        options=("--model", "flow", "--drafts", "shipped", "--encoding", "positions"),
     ),
 )
 

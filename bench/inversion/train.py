@@ -83,7 +83,7 @@ def train_worker(group: ProcessGroup, plan: Plan, out: Path, log: Path | None) -
     """Execute `train` in one process of the group."""
     writer = Log(log if group.is_main else None)
     targets, extractor, encoding, training = plan.targets, plan.extractor, plan.encoding, plan.training
-    sets = _check_targets(targets)
+    sets = _check_targets(targets, encoding)
     shared = {source.content_hash() for source in plan.photographs} & {source.content_hash() for source in plan.validation}
     if shared:
         raise UserError(f"{len(shared)} photographs are in both the training and the validation set; remove them from one set")
@@ -92,7 +92,8 @@ def train_worker(group: ProcessGroup, plan: Plan, out: Path, log: Path | None) -
     views = collect_views(list(plan.photographs), source) if few else LazyViews(plan.photographs, source)
     unseen = collect_views(list(plan.validation), source)[::4]  # unmirrored, at 256 pixels
     examples, held_out, errors = _build_examples(plan, views, unseen)
-    symmetries = POSITION_SYMMETRIES if encoding == "positions" else find_symmetries(extractor)
+    only_positions = encoding == "positions" and plan.drafts is None
+    symmetries = POSITION_SYMMETRIES if only_positions else find_symmetries(extractor)
     examples = dataclasses.replace(examples, symmetries=symmetries)
     slots, length = _measure_stack(held_out, unseen[0], encoding)
     first = held_out.release_view(unseen[0], np.random.default_rng(0))
@@ -180,16 +181,16 @@ def select_views(views: Sequence[PhotographView]) -> Sequence[PhotographView]:
     return views[:: 4 * math.ceil(len(views) / (4 * MAX_COMPARED))]
 
 
-def _check_targets(targets: Sequence[Target]) -> bool:
+def _check_targets(targets: Sequence[Target], encoding: Encoding) -> bool:
     """Return whether any target releases word sets.
 
     Raises
     ------
     UserError
-        if some, but not all, release subspaces.
+        if some, but not all, release subspaces, and the network reads more than positions.
     """
     releases = {target.defense.releases for target in targets}
-    if Subspaces in releases and len(releases) > 1:
+    if Subspaces in releases and len(releases) > 1 and encoding != "positions":
         raise UserError(
             "--defense: a network for subspaces reads no other releases; train another network for the other defenses"
         )
