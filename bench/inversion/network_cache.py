@@ -43,6 +43,7 @@ def build_key(plan: Plan) -> dict[str, Any]:
             train.__name__,
             *sorted({type(part).__module__ for target in plan.targets for part in list_parts(target.defense)}),
             type(plan.extractor).__module__,
+            *([type(plan.drafts).__module__] if plan.drafts else []),
         ),
         "environment": environment.describe_platform(),
     }

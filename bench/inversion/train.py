@@ -192,7 +192,8 @@ def _check_targets(targets: Sequence[Target], encoding: Encoding) -> bool:
     releases = {target.defense.releases for target in targets}
     if Subspaces in releases and len(releases) > 1 and encoding != "positions":
         raise UserError(
-            "--defense: a network for subspaces reads no other releases; train another network for the other defenses"
+            "--defense: a network for subspaces reads no other releases; train another network for the other defenses, or a "
+            "network that reads positions and drafts alone (--model flow --encoding positions --drafts shipped)"
         )
     return WordSets in releases
 

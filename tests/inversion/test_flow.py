@@ -409,3 +409,24 @@ def test_without_a_network_it_does_not_apply(monkeypatch: pytest.MonkeyPatch, tm
 def test_fields_have_limits(fields: Mapping[str, float]) -> None:
     with pytest.raises(UserError, match="at least"):
         Generative(**fields)  # type: ignore[arg-type]
+
+
+@pytest.mark.slow
+def test_drafts_and_positions_serve_all_kinds_of_releases(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also subspaces beside others. The network of `dia` makes each draft."""
+    import bench.inversion.train as module
+
+    monkeypatch.setattr(module, "TOLERANCE", 0.5)  # of errors on single photographs
+    defenses = (Undefended(), Affine(), LDP())
+    targets = [Target(defense=defense, supported_settings={}) for defense in defenses]
+    drafts, out = Drafter(Asset("shipped"), Sift()), tmp_path / "W.safetensors"
+    given = {"targets": targets, "extractor": Sift(), "drafts": drafts}
+    with pytest.raises(UserError, match="--encoding positions --drafts shipped"):
+        train(build_plan(**given), out)
+    meta = train(build_plan(**given, encoding="positions", training=dataclasses.replace(TINY, steps=2)), out)
+    assert sorted(meta["drafts"]) == ["affine", "ldp", "none"]
+    attack, sources = Generative(weights=Asset(str(out)), steps=1), [photographs.list_builtin()[3].path]
+    records = bench.run(list(defenses), [attack, DIA()], sources)
+    scores = {(record["defense"]["name"], record["attack"]["name"]): record["metrics"]["ssim"] for record in records}
+    for defense in defenses:  # hardly trained, so it returns the draft, which is one of the eight that `dia` averages
+        assert scores[defense.name(), "generative"] == pytest.approx(scores[defense.name(), "dia"], abs=0.1)
