@@ -13,10 +13,13 @@ follows the velocity to t = 1. With probability `DROPPED` a training sample has 
 velocity of the prior, u. With guidance w, a sample follows u + w (v - u): w = 0 gives the prior, w = 1 the posterior.
 
 The network is the inversion network up to the features of each cell. Its input also has x_t, and t shifts the levels. A draft,
-which is another network's reconstruction, can be part of it too, and is lost together with the release. The head predicts the
-photograph minus the draft. The velocity is then (prediction - x_t) / (1 - t). So the noise that the photograph lacks needs no
-weights to be removed, and an untrained network returns the draft. Prediction of the photograph and loss of the velocity: Li and
-He, Back to Basics: Let Denoising Generative Models Denoise (2025).
+which is another network's reconstruction, can be part of it too, and is lost together with the release. If coefficients were
+independent Gaussians with the draft d as mean and with variance s², the velocity would be
+
+    d + (t s² - (1 - t)) / D (x_t - t d),    D = (1 - t)² + t² s².
+
+The head predicts the rest, which has variance s² / D. The variance grows with the energy of the draft around a cell, so smooth
+parts remain smooth. Without a draft, d is 0 and s is 1. So an untrained network samples cells around the draft.
 
 The path and the solver are ten lines, so no library is used. torchcfm has this path, and couplings of noise and photographs,
 which do not apply if each photograph has its own release. Schedulers of diffusers expect its models. torchdiffeq adapts its
@@ -45,7 +48,8 @@ SHIFT = 3.0  # of the times in training and of the solver (`warp_time`)
 FREQUENCIES = 6  # of the embedding of t
 TIME_WIDTH = 64  # of the embedding of t
 WIDTH = 64  # channels of the head
-MIN_REST = 0.05  # least 1 - t by which a velocity is divided
+WINDOW = 5  # cells: side of the window of the energy of a draft
+MIN_VARIANCE = 0.01  # of a coefficient around its draft
 
 Velocity = Callable[[Tensor, float], Tensor]  # x_t, t -> velocity
 
@@ -55,18 +59,22 @@ class FlowNetwork(GridNetwork):
 
     mean: Tensor  # (48, 1, 1) of the coefficients over the training photographs
     spread: Tensor  # (48, 1, 1) their standard deviation
+    floor: Tensor  # (48, 1, 1) variance around a draft without energy
+    slope: Tensor  # (48, 1, 1) growth of the variance with the energy of the draft
 
     def __init__(self, shape: Shape) -> None:
         super().__init__(shape)
         first = shape.widths[0]
         self.register_buffer("mean", torch.zeros(CHANNELS, 1, 1))
         self.register_buffer("spread", torch.ones(CHANNELS, 1, 1))
+        self.register_buffer("floor", torch.ones(CHANNELS, 1, 1))
+        self.register_buffer("slope", torch.zeros(CHANNELS, 1, 1))
         self.read = nn.Conv2d(2 * CHANNELS, self.channels, 1)
         self.time = nn.Sequential(nn.Linear(2 * FREQUENCIES, TIME_WIDTH), nn.SiLU())
         self.shifts = nn.ModuleList(nn.Linear(TIME_WIDTH, width) for width in shape.widths)
         last = nn.Conv2d(WIDTH, CHANNELS, 3, padding=1)
         self.head = nn.Sequential(nn.Conv2d(first + 2 * CHANNELS, WIDTH, 3, padding=1), nn.SiLU(), last)
-        for weight in (*last.parameters(), *self.shifts.parameters()):  # untrained: the draft
+        for weight in (*last.parameters(), *self.shifts.parameters()):  # untrained: independent Gaussians
             nn.init.zeros_(weight)
 
     def forward(self, batch: NoisyRelease) -> Tensor:
@@ -78,30 +86,36 @@ class FlowNetwork(GridNetwork):
         photographs = self.to_cells(batch.photographs)
         time = batch.time[:, None, None, None]
         noisy = (1 - time) * batch.noise + time * photographs
-        target = (photographs - noisy) / (1 - time).clamp(min=MIN_REST)  # the velocity, but at the end of the path
-        error = self.predict(self.build_condition(batch), noisy, batch.time) - target
+        error = self.predict(self.build_condition(batch), noisy, batch.time) - (photographs - batch.noise)
         return error * (self.spread / self.spread.mean()).sqrt()
 
     def build_condition(self, points: EncodedRelease) -> Tensor:
-        """Return what the network reads of releases and their drafts, zero without a release. -> (B, C, H/4, W/4)"""
+        """Return what the network reads of releases: cells, drafts, variances around these - 1. -> (B, C, H/4, W/4)
+
+        It is zero without a release.
+        """
         cells = self.scatter(points)
         if points.drafts is None:
-            drafts = cells.new_zeros(points.batch, CHANNELS, *points.grid)
+            rest = cells.new_zeros(points.batch, 2 * CHANNELS, *points.grid)
         else:
             drafts = self.to_cells(points.drafts)
-            drafts = drafts if points.drafted is None else drafts * points.drafted[:, None, None, None]
-        return torch.cat([cells, drafts], dim=1)
+            variance = (self.floor + self.slope * measure_energy(drafts)).clamp(min=MIN_VARIANCE)
+            rest = torch.cat([drafts, variance - 1], dim=1)
+            rest = rest if points.drafted is None else rest * points.drafted[:, None, None, None]
+        return torch.cat([cells, rest], dim=1)
 
     def predict(self, condition: Tensor, noisy: Tensor, time: Tensor) -> Tensor:
         """Return the velocity. (B, C, H/4, W/4) from `build_condition`, (B, 48, H/4, W/4), (B,) -> (B, 48, H/4, W/4)"""
         rows, columns = noisy.shape[2:]
-        cells, draft = condition.split((self.channels, CHANNELS), dim=1)
+        cells, draft, excess = condition.split((self.channels, CHANNELS, CHANNELS), dim=1)
         embedded = self.time(embed_time(time))
         shifts = [shift(embedded)[:, :, None, None] for shift in self.shifts]
         images = torch.cat([noisy, draft], dim=1)
         features = self.refine_grid(cells + self.read(images), shifts)[:, :, :rows, :columns]
-        photograph = draft + self.head(torch.cat([features, images.to(features.dtype)], dim=1)).float()
-        return (photograph - noisy) / (1 - time).clamp(min=MIN_REST)[:, None, None, None]
+        rest = self.head(torch.cat([features, images.to(features.dtype)], dim=1)).float()
+        time, variance = time[:, None, None, None], 1 + excess
+        total = (1 - time) ** 2 + time**2 * variance
+        return draft + (time * variance - (1 - time)) / total * (noisy - time * draft) + (variance / total).sqrt() * rest
 
     def to_cells(self, images: Tensor) -> Tensor:
         """Return the scaled coefficients of images; incomplete cells repeat the border. (B, 3, H, W) -> (B, 48, H/4, W/4)"""
@@ -124,6 +138,23 @@ class FlowNetwork(GridNetwork):
         mean, square = torch.stack(moments).mean(dim=0)
         self.mean.copy_(mean[:, None, None])
         self.spread.copy_((square - mean**2).clamp(min=0).sqrt().clamp(min=1e-3)[:, None, None])
+
+    def measure_variance(self, drafts: Tensor, photographs: Tensor) -> None:
+        """Fit the variance around drafts: a line through the means of the cells with less and with more energy. (B, 3, H, W)"""
+        cells = self.to_cells(drafts)
+        squares = (self.to_cells(photographs) - cells).square().transpose(0, 1).flatten(1)  # (48, cells)
+        energy = measure_energy(cells).flatten()
+        much = energy > energy.median()
+        low, high = (squares[:, part].mean(dim=1) for part in (~much, much))
+        slope = ((high - low) / (energy[much].mean() - energy[~much].mean())).clamp(min=0)
+        self.slope.copy_(slope[:, None, None])
+        self.floor.copy_((low - slope * energy[~much].mean()).clamp(min=MIN_VARIANCE)[:, None, None])
+
+
+def measure_energy(cells: Tensor) -> Tensor:
+    """Return the mean square of the coefficients around each cell, without those of constant colour. -> (B, 1, H/4, W/4)"""
+    varying = cells.unflatten(1, (3, -1))[:, :, 1:].square().mean(dim=(1, 2))  # (B, H/4, W/4)
+    return nnf.avg_pool2d(varying[:, None], WINDOW, 1, WINDOW // 2, count_include_pad=False)
 
 
 def transform_cells(cells: Tensor, inverse: bool = False) -> Tensor:

@@ -57,6 +57,7 @@ CHECKPOINT_EVERY = 250  # steps
 MAX_VALIDATED = 100  # photographs
 VALIDATION_STEPS = 8  # of the solver, for a network that samples photographs
 MAX_IN_MEMORY = 2000  # photographs, about 6 GB; with more photographs, views are computed on demand
+DRAFTED = 64  # training examples by which the variance around drafts is measured
 MAX_COMPARED = 1000  # training photographs for the comparison of quantisation errors
 TOLERANCE = 0.05  # relative difference of the quantisation errors on training and on unseen photographs
 
@@ -130,6 +131,8 @@ def train_worker(group: ProcessGroup, plan: Plan, out: Path, log: Path | None) -
     if trainer.step == 0:
         descriptor_slots = slots if sets and not candidates else 1
         trainer.initialise(views, None if initial is None else initial.module, descriptor_slots)
+        if plan.drafts is not None:
+            trainer.measure_variance(examples)
     module = trainer.run(examples)
     if not group.is_main:
         return meta
@@ -313,6 +316,17 @@ class _Trainer(Learner[AnyNetwork]):
             weights.initialise_from(self.module, trained, candidates)
         self.reset_average()
 
+    def measure_variance(self, examples: Examples) -> None:
+        """Fit the variance around drafts to some training examples."""
+        assert isinstance(self.module, FlowNetwork)
+        assert self.drafts is not None
+        drawn = [examples.draw(np.random.default_rng([self.training.seed, number])) for number in range(DRAFTED)]
+        points, photographs = build_batch(drawn, self.meta["slots"], self.meta["encoding"])
+        drafted = add_drafts(points, drawn, self.drafts, examples.public)
+        assert drafted.drafts is not None
+        self.module.measure_variance(drafted.drafts.to(self.device), photographs.to(self.device))
+        self.reset_average()
+
     def run(self, examples: Examples) -> AnyNetwork:
         """Train to the end, and return the network with averaged weights."""
         if self.step == self.training.steps:
@@ -394,7 +408,7 @@ def build_batch(examples: Sequence[Example], slots: int, encoding: Encoding, sam
     return points, pixels.permute(0, 3, 1, 2).float() / 255
 
 
-def add_drafts(points: Encoded, examples: Sequence[Example], drafts: Drafts, public: Public) -> Encoded:
+def add_drafts(points: Encoded, examples: Sequence[Example], drafts: Drafts, public: Public) -> EncodedRelease:
     """Add the drafts of the examples to their encoded releases."""
     assert isinstance(points, EncodedRelease)  # only the model "flow" reads drafts, and it reads points
     images = np.stack([drafts(example.defense, example.release, public) for example in examples])
