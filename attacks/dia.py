@@ -49,12 +49,9 @@ class DIA(ImageAttack):
         return _choose(self.weights, defense, extractor, public)[1]
 
     def assets(self, defense: Defense, extractor: Extractor, public: Public) -> Mapping[str, str]:
-        network = self._network(defense, extractor, public)
-        if network.meta["encoding"] == "posteriors":
-            from bench.context.reconstruct import load_context
+        from bench.context.reconstruct import verify
 
-            load_context(network).verify()
-        return {"weights": network.verify()}  # its metadata have the digest of the context model
+        return {"weights": verify(self._network(defense, extractor, public))}
 
     def reconstruct(self, view: View, rng: np.random.Generator) -> Floats:
         from bench.context.reconstruct import reconstruct_release

@@ -71,7 +71,11 @@ class Generative(ImageAttack):
         return f"no adapted attacker{details}; train one with `bench train --model flow` and pass generative:weights=FILE"
 
     def assets(self, defense: Defense, extractor: Extractor, public: Public) -> Mapping[str, str]:
-        return {"weights": self._network(defense, extractor, public).verify()}
+        from bench.context.drafts import Drafter
+
+        network = self._network(defense, extractor, public)
+        drafts = {"drafts": Drafter(self.drafts, extractor).digest(defense, public)} if network.meta.get("drafts") else {}
+        return {"weights": network.verify(), **drafts}
 
     def reconstruct(self, view: View, rng: np.random.Generator) -> Floats:
         return self.sample(view, rng).mean(axis=0, dtype=np.float32)
@@ -86,7 +90,7 @@ class Generative(ImageAttack):
         settings, module = network.encode_settings(view.defense, public), network.module
         assert isinstance(module, FlowNetwork)  # by the metadata
         points = encode([view.release], [settings], network.meta["slots"], network.meta["encoding"])
-        if network.meta.get("drafts") is not None:
+        if network.meta.get("drafts"):
             points = replace(points, drafts=self._draft(view, public))
         images = sample_images(module, points, self.samples, self.steps, self.guidance, rng)
         return images.permute(0, 2, 3, 1).cpu().numpy()
@@ -103,7 +107,7 @@ class Generative(ImageAttack):
     def _explain_other_drafts(self, network: Network, defense: Defense, extractor: Extractor, public: Public) -> str | None:
         """Return the reason why there are no drafts as the network was trained with; None if there are, or it reads none."""
         digests = network.meta.get("drafts")
-        if digests is None:
+        if not digests:
             return None
         path, details = find_network(self.drafts, DRAFTS, defense, extractor, public)
         if path is not None and load(path).digest == digests.get(defense.name()):

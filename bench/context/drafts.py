@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from bench.api import Defense, Extractor
 from bench.codebook.public import Public
-from bench.context.reconstruct import reconstruct_release
+from bench.context.reconstruct import reconstruct_release, verify
 from bench.core.errors import UserError
 from bench.inversion.symmetry import IDENTITY
 from bench.inversion.weights import SHIPPED, Network, find_network, load
@@ -26,14 +26,14 @@ class Drafter:
     extractor: Extractor
 
     def digest(self, defense: Defense, public: Public) -> str:
-        """Return the digest of the network for the releases of a defense.
+        """Verify the network for the releases of a defense, and return its digest.
 
         Raises
         ------
         UserError
-            if there is none.
+            if there is none, or a file does not match its metadata.
         """
-        return self._load(defense, public).digest
+        return verify(self._load(defense, public))
 
     def __call__(self, defense: Defense, release: Release, public: Public) -> Floats:
         """Return the draft of a release. -> (H, W, 3) in [0, 1]"""

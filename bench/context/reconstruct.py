@@ -45,6 +45,21 @@ def reconstruct_release(
     return reconstruct_from_posteriors(network.module, load_context(network).module, release, odds, symmetries)
 
 
+def verify(network: Network) -> str:
+    """Verify a network and the context model that it reads, and return the digest of the network.
+
+    Its metadata have that of the context model.
+
+    Raises
+    ------
+    UserError
+        if a file does not match its metadata, or the installed context model is another.
+    """
+    if network.meta["encoding"] == "posteriors":
+        load_context(network).verify()
+    return network.verify()
+
+
 def load_context(network: Network) -> weights.Network:
     """Load the context model that a network was trained with.
 
