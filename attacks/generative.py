@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 SHIPPED = {"shipped": "flow-*.safetensors"}
+UNUSED = "unused"  # in records: drafts of a network that reads none
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,8 +75,9 @@ class Generative(ImageAttack):
         from bench.context.drafts import Drafter
 
         network = self._network(defense, extractor, public)
-        drafts = {"drafts": Drafter(self.drafts, extractor).digest(defense, public)} if network.meta.get("drafts") else {}
-        return {"weights": network.verify(), **drafts}
+        reads_drafts = bool(network.meta.get("drafts"))
+        drafts = Drafter(self.drafts, extractor).digest(defense, public) if reads_drafts else UNUSED
+        return {"weights": network.verify(), "drafts": drafts}
 
     def reconstruct(self, view: View, rng: np.random.Generator) -> Floats:
         return self.sample(view, rng).mean(axis=0, dtype=np.float32)
@@ -106,13 +108,15 @@ class Generative(ImageAttack):
 
     def _explain_other_drafts(self, network: Network, defense: Defense, extractor: Extractor, public: Public) -> str | None:
         """Return the reason why there are no drafts as the network was trained with; None if there are, or it reads none."""
-        digests = network.meta.get("drafts")
+        digests, name = network.meta.get("drafts"), network.path.name
         if not digests:
-            return None
+            return None if self.drafts in (*DRAFTS, UNUSED) else f"{name} reads no drafts; omit generative:drafts"
         path, details = find_network(self.drafts, DRAFTS, defense, extractor, public)
-        if path is not None and load(path).digest == digests.get(defense.name()):
+        if path is None:
+            return f"{name} reads drafts, and no network makes them{details}; pass one with generative:drafts=FILE"
+        if load(path).digest == digests.get(defense.name()):
             return None
-        return f"{network.path.name} reads drafts of another network{details}; pass that one with generative:drafts=FILE"
+        return f"{name} reads drafts of another network than {path.name}; pass that one with generative:drafts=FILE"
 
     def _network(self, defense: Defense, extractor: Extractor, public: Public) -> Network:
         path, details = find_network(self.weights, SHIPPED, defense, extractor, public, model="flow")

@@ -157,7 +157,10 @@ class _LocalInputs:
             Asset(name): tensor_file.read_header(ASSETS / file)[2] for name, file in SHIPPED.items() if (ASSETS / file).is_file()
         }
         clustered = {Asset(name): name_digest(shipped[Asset(source)]) for name, source in CLUSTERED.items() if source in shipped}
-        own = {Asset(file): tensor_file.read_header(file)[2] for file in files}
+        try:
+            own = {Asset(file): tensor_file.read_header(file)[2] for file in files}
+        except UserError as error:
+            raise UserError(f"--file {error}") from None
         self.assets = {digest: name for name, digest in (shipped | clustered | own).items()}  # digest -> value of a field
 
     def photographs(self, record: Record) -> Images:

@@ -56,7 +56,7 @@ if TYPE_CHECKING:
 TEXT = """# Samples of the generative attack
 
 {count} photographs of `{list}.txt`, upright SIFT features, seed 0. `generative` draws {samples} samples of each photograph with
-{steps} steps and guidance {guidance:g}. `prior` draws them with guidance 0, which does not read the release.
+{steps} steps and guidance {guidance:g}. `prior` draws them with guidance 0, which reads neither the release nor its draft.
 
 - *a sample*: the mean score of the samples.
 - *best*: the best score among the samples. It is chosen with the photograph, so it is a reference and no attack. The best of the
@@ -268,6 +268,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True, help="the folder of train/, tune.txt and test.txt")
     parser.add_argument("--training", type=Path, required=True, help="folder of the photographs that the network was trained on")
     parser.add_argument("--weights", default="shipped", help="a network of `bench train --model flow` (default: %(default)s)")
+    parser.add_argument("--drafts", default="shipped", help="the network for drafts of its training (default: those of dia)")
     parser.add_argument("--list", choices=("tune", "test"), default="test", help="of photographs (default: %(default)s)")
     parser.add_argument("--defense", action="append", required=True, help="may be repeated; the network serves the first")
     parser.add_argument("--photographs", type=int, default=100, help="of the list (default: %(default)s)")
@@ -280,7 +281,8 @@ def main() -> None:
     named = {source.name: source for source in photographs.list_photographs(args.data / "train")}
     tested = [named[name] for name in (args.data / f"{args.list}.txt").read_text().split()[: args.photographs]]
     training = photographs.list_photographs(args.training)
-    attack = Generative(weights=Asset(args.weights), samples=args.samples, steps=args.steps, guidance=args.guidance)
+    networks = {"weights": Asset(args.weights), "drafts": Asset(args.drafts)}
+    attack = Generative(**networks, samples=args.samples, steps=args.steps, guidance=args.guidance)
     defenses = {spec.read(each, discovery.DEFENSE): each for each in args.defense}
     text, configurations = evaluate(defenses, attack, tested, training, args.list)
     save_figure(draw_samples(list(defenses), attack, photographs.list_builtin()[:PICTURED]), PICTURE, configurations)

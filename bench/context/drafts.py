@@ -42,5 +42,6 @@ class Drafter:
     def _load(self, defense: Defense, public: Public) -> Network:
         path, details = find_network(self.network, SHIPPED, defense, self.extractor, public)
         if path is None:
-            raise UserError(f"no network makes drafts for {defense.name()}{details}; train one with `bench train` and pass it")
+            advice = "train one with `bench train`, and pass it with --drafts FILE"
+            raise UserError(f"no network makes drafts for {defense.name()}{details}; {advice}")
         return load(path)

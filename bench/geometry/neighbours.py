@@ -66,13 +66,13 @@ class Neighbours:
         import torch
 
         rows = torch.from_numpy(words).to(self._words.device)
-        scores = (self._words[rows] @ self._words.T) / self._lengths.float()  # (n, K)
-        scores[torch.arange(len(rows)), rows] = torch.inf  # of the word itself
+        products = self._words[rows] @ self._words.T  # (n, K)
+        scores = products / self._lengths.float()
+        scores[torch.arange(len(rows)), rows] = torch.finfo(scores.dtype).max  # of the word itself
         least = _find_lower_bound(scores, count)  # (n, 1)
         owners, others = (scores >= least - SLACK * least.abs()).nonzero(as_tuple=True)
         own = rows[owners]
-        dots = (self._words[own] * self._words[others]).sum(dim=1).double()
-        cosines = dots / (self._lengths[own] * self._lengths[others])
+        cosines = products[owners, others].double() / (self._lengths[own] * self._lengths[others])
         cosines[own == others] = 2.0
         row, word, cosine = (part.cpu().numpy() for part in (owners, others, cosines))
         order = np.lexsort((word, -cosine, row))

@@ -54,7 +54,7 @@ class EncodedRelease(Encoded):
     coordinates: Tensor  # (P, 2) float32, column and row in cells
     weights: Tensor | None = None  # (P,) of each keypoint's embedding; None: 1
     drafts: Tensor | None = None  # (B, 3, H, W) RGB in [0, 1], reconstructions of the photographs; None: not read
-    drafted: Tensor | None = None  # (B,) weights of the drafts; None: 1
+    draft_weights: Tensor | None = None  # (B,) of the drafts; None: 1
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

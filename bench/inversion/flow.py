@@ -13,7 +13,7 @@ follows the velocity to t = 1. With probability `DROPPED` a training sample has 
 velocity of the prior, u. With guidance w, a sample follows u + w (v - u): w = 0 gives the prior, w = 1 the posterior.
 
 The network is the inversion network up to the features of each cell. Its input also has x_t, and t shifts the levels. A draft,
-which is another network's reconstruction, can be part of it too, and is lost together with the release. If coefficients were
+which is another network's reconstruction, can be part of it too, and is dropped together with the release. If coefficients were
 independent Gaussians with the draft d as mean and with variance s², the velocity would be
 
     d + (t s² - (1 - t)) / D (x_t - t d),    D = (1 - t)² + t² s².
@@ -50,6 +50,7 @@ TIME_WIDTH = 64  # of the embedding of t
 WIDTH = 64  # channels of the head
 WINDOW = 5  # cells: side of the window of the energy of a draft
 MIN_VARIANCE = 0.01  # of a coefficient around its draft
+MIN_GAP = 1e-6  # least difference of energies that determines a slope
 
 Velocity = Callable[[Tensor, float], Tensor]  # x_t, t -> velocity
 
@@ -101,7 +102,7 @@ class FlowNetwork(GridNetwork):
             drafts = self.to_cells(points.drafts)
             variance = (self.floor + self.slope * measure_energy(drafts)).clamp(min=MIN_VARIANCE)
             rest = torch.cat([drafts, variance - 1], dim=1)
-            rest = rest if points.drafted is None else rest * points.drafted[:, None, None, None]
+            rest = rest if points.draft_weights is None else rest * points.draft_weights[:, None, None, None]
         return torch.cat([cells, rest], dim=1)
 
     def predict(self, condition: Tensor, noisy: Tensor, time: Tensor) -> Tensor:
@@ -140,15 +141,21 @@ class FlowNetwork(GridNetwork):
         self.spread.copy_((square - mean**2).clamp(min=0).sqrt().clamp(min=1e-3)[:, None, None])
 
     def measure_variance(self, drafts: Tensor, photographs: Tensor) -> None:
-        """Fit the variance around drafts: a line through the means of the cells with less and with more energy. (B, 3, H, W)"""
+        """Fit the variance around drafts: a line through the means of the cells with less and with more energy. (B, 3, H, W)
+
+        It is constant if all cells have the same energy.
+        """
         cells = self.to_cells(drafts)
         squares = (self.to_cells(photographs) - cells).square().transpose(0, 1).flatten(1)  # (48, cells)
         energy = measure_energy(cells).flatten()
         much = energy > energy.median()
-        low, high = (squares[:, part].mean(dim=1) for part in (~much, much))
-        slope = ((high - low) / (energy[much].mean() - energy[~much].mean())).clamp(min=0)
+        slope, floor = torch.zeros_like(squares[:, 0]), squares.mean(dim=1)
+        if much.any() and (gap := energy[much].mean() - energy[~much].mean()) > MIN_GAP:
+            low, high = (squares[:, part].mean(dim=1) for part in (~much, much))
+            slope = ((high - low) / gap).clamp(min=0)
+            floor = low - slope * energy[~much].mean()
         self.slope.copy_(slope[:, None, None])
-        self.floor.copy_((low - slope * energy[~much].mean()).clamp(min=MIN_VARIANCE)[:, None, None])
+        self.floor.copy_(floor.clamp(min=MIN_VARIANCE)[:, None, None])
 
 
 def measure_energy(cells: Tensor) -> Tensor:
@@ -188,7 +195,7 @@ def add_noise(points: Encoded, photographs: Tensor, rngs: Sequence[np.random.Gen
     dropped = np.array([rng.random() < DROPPED for rng in rngs])
     kept = torch.from_numpy(~dropped).float()
     return NoisyRelease(
-        **vars(points) | {"weights": kept[points.image], "drafted": kept},
+        **vars(points) | {"weights": kept[points.image], "draft_weights": kept},
         photographs=photographs,
         noise=torch.from_numpy(noise),
         time=torch.from_numpy(time),
@@ -241,13 +248,9 @@ def guide(module: FlowNetwork, condition: Tensor, guidance: float) -> Velocity:
 
 
 def solve(velocity: Velocity, start: Tensor, times: Sequence[float]) -> Tensor:
-    """Integrate a velocity from the first to the last time by Heun's method, of second order.
-
-    The last step is Euler's, since a velocity may be undefined at the last time.
-    """
+    """Integrate a velocity from the first to the last time by Heun's method, of second order."""
     x = start
     for time, after in itertools.pairwise(times):
         slope = velocity(x, time)
-        ahead = x + (after - time) * slope
-        x = ahead if after == times[-1] else x + (after - time) / 2 * (slope + velocity(ahead, after))
+        x = x + (after - time) / 2 * (slope + velocity(x + (after - time) * slope, after))
     return x

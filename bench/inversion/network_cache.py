@@ -35,7 +35,7 @@ def build_key(plan: Plan) -> dict[str, Any]:
         "start": None if plan.initial_checkpoint is None else weights.load(plan.initial_checkpoint).digest,
         "encoding": plan.encoding,
         "model": plan.model,
-        "drafts": plan.drafts and {target.defense.name(): plan.drafts.digest(target.defense, public) for target in plan.targets},
+        "drafts": None if plan.drafts is None else train.find_drafts(plan.targets, plan.drafts),
         "keypoints": plan.keypoints,
         "widths": list(plan.widths),
         "training": dataclasses.asdict(plan.training),

@@ -49,15 +49,16 @@ from bench.inversion.plan import Drafts, Plan, Training
 from bench.inversion.process_group import ProcessGroup, launch
 from bench.inversion.reconstruct import infer, locate_keypoints
 from bench.inversion.symmetry import IDENTITY, POSITION_SYMMETRIES, find_symmetries
-from bench.settings import Asset, OneOf
-from bench.types import Subspaces, WordSets
+from bench.registry.composed import configure
+from bench.settings import Asset, Between, OneOf
+from bench.types import Descriptors, Subspaces, WordSets
 
 CHECKPOINT = "inversion-checkpoint"
 CHECKPOINT_EVERY = 250  # steps
 MAX_VALIDATED = 100  # photographs
 VALIDATION_STEPS = 8  # of the solver, for a network that samples photographs
 MAX_IN_MEMORY = 2000  # photographs, about 6 GB; with more photographs, views are computed on demand
-DRAFTED = 64  # training examples by which the variance around drafts is measured
+VARIANCE_EXAMPLES = 64  # training examples by which the variance around drafts is measured
 MAX_COMPARED = 1000  # training photographs for the comparison of quantisation errors
 TOLERANCE = 0.05  # relative difference of the quantisation errors on training and on unseen photographs
 
@@ -85,6 +86,7 @@ def train_worker(group: ProcessGroup, plan: Plan, out: Path, log: Path | None) -
     writer = Log(log if group.is_main else None)
     targets, extractor, encoding, training = plan.targets, plan.extractor, plan.encoding, plan.training
     sets = _check_targets(targets, encoding)
+    drafts = None if plan.drafts is None else find_drafts(targets, plan.drafts)
     shared = {source.content_hash() for source in plan.photographs} & {source.content_hash() for source in plan.validation}
     if shared:
         raise UserError(f"{len(shared)} photographs are in both the training and the validation set; remove them from one set")
@@ -101,7 +103,6 @@ def train_worker(group: ProcessGroup, plan: Plan, out: Path, log: Path | None) -
     samples = _count_samples(targets, encoding)
     if plan.model == "flow" and samples:
         raise UserError("--model flow: it reads points, and the defense hides positions; pass another --defense")
-    drafts = plan.drafts and {target.defense.name(): plan.drafts.digest(target.defense, Public()) for target in targets}
     sample, _ = build_batch([first], slots, encoding, samples)
     candidates = slots if encoding == "invariant" and sets else 0
     shape = Shape(inputs=sample.values.shape[1], candidates=candidates, length=length, widths=plan.widths, samples=samples)
@@ -182,6 +183,29 @@ def _build_examples(
 def select_views(views: Sequence[PhotographView]) -> Sequence[PhotographView]:
     """Return the unmirrored view at 256 pixels of at most `MAX_COMPARED` photographs."""
     return views[:: 4 * math.ceil(len(views) / (4 * MAX_COMPARED))]
+
+
+def find_drafts(targets: Sequence[Target], drafts: Drafts) -> dict[str, str]:
+    """Return the digest of the network that makes the drafts for each defense.
+
+    Raises
+    ------
+    UserError
+        if there is none for the least or greatest supported settings of a target, or there are several.
+    """
+    found: dict[str, set[str]] = {}
+    for target in targets:
+        limits = [
+            (setting.low, setting.high) if isinstance(setting, Between) else setting.values
+            for setting in target.supported_settings.values()
+        ]
+        for values in itertools.product(*limits):
+            defense = configure(target.defense, dict(zip(target.supported_settings, values, strict=True)))
+            found.setdefault(defense.name(), set()).add(drafts.digest(defense, Public()))
+    several = [name for name, digests in found.items() if len(digests) > 1]
+    if several:
+        raise UserError(f"--drafts: several networks serve {', '.join(several)}; pass one network, or fewer settings")
+    return {name: digests.pop() for name, digests in found.items()}
 
 
 def _check_targets(targets: Sequence[Target], encoding: Encoding) -> bool:
@@ -267,9 +291,9 @@ def _measure_stack(examples: Examples, view: PhotographView, encoding: Encoding)
     Raises
     ------
     UserError
-        if the targets release descriptors of several lengths.
+        if the targets release descriptors of several lengths, or only some release scales and orientations.
     """
-    slots, lengths = 0, set()
+    slots, lengths, frames = 0, set(), set()
     for target in examples.targets:
         most = {
             name: OneOf((max(given.values),)) for name, given in target.supported_settings.items() if isinstance(given, OneOf)
@@ -279,6 +303,9 @@ def _measure_stack(examples: Examples, view: PhotographView, encoding: Encoding)
         _, used, length = stack(release, encoding).shape
         slots = max(slots, used)
         lengths.add(length)
+        frames.add(isinstance(release, Descriptors) and release.frames is not None)
+    if len(frames) > 1:
+        raise UserError("--defense: some of them release scales and orientations, and others none; train a network for each kind")
     if len(lengths) > 1:
         raise UserError(f"--defense: one network reads descriptors of one length, got {sorted(lengths)}")
     return slots, lengths.pop()
@@ -320,7 +347,7 @@ class _Trainer(Learner[AnyNetwork]):
         """Fit the variance around drafts to some training examples."""
         assert isinstance(self.module, FlowNetwork)
         assert self.drafts is not None
-        drawn = [examples.draw(np.random.default_rng([self.training.seed, number])) for number in range(DRAFTED)]
+        drawn = [examples.draw(np.random.default_rng([self.training.seed, number])) for number in range(VARIANCE_EXAMPLES)]
         points, photographs = build_batch(drawn, self.meta["slots"], self.meta["encoding"])
         drafted = add_drafts(points, drawn, self.drafts, examples.public)
         assert drafted.drafts is not None

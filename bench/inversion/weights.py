@@ -133,6 +133,9 @@ def _are_metadata(meta: dict[str, Any]) -> bool:
     supported = [target.get("serves") for target in targets]
     if not all(isinstance(settings, dict) and all(map(_is_setting, settings.values())) for settings in supported):
         return False
+    drafts = meta.get("drafts") or {}
+    if not (isinstance(drafts, dict) and all(isinstance(digest, str) for digest in drafts.values())):
+        return False
     if meta.get("model") not in list(MODELS):
         return False
     return isinstance(meta["shape"], dict) and type(meta["slots"]) is int and meta["encoding"] in get_args(Encoding)

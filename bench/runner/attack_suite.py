@@ -1,4 +1,4 @@
-"""Suites of attacks: versioned lists of attacks at fixed settings, for `bench run --attack standard-2026.2`.
+"""Suites of attacks: versioned lists of attacks at fixed settings, for `bench run --attack standard-2026.3`.
 
 A suite is the file suites/NAME-VERSION.toml. It fixes all fields of its attacks except files: a network is trained for a
 defense, so its file differs. Records are of single attacks, so they do not depend on the suite. Comparing the attacks of
@@ -97,7 +97,7 @@ def read_attacks(texts: Sequence[str]) -> list[Attack]:
 def is_suite(text: str) -> bool:
     """Return whether a text names a suite of attacks and not an attack: its name has a point.
 
-    >>> is_suite("standard-2026.2"), is_suite("density:width=0.5")
+    >>> is_suite("standard-2026.3"), is_suite("density:width=0.5")
     (True, False)
     """
     return "." in text.partition(":")[0]

@@ -43,6 +43,24 @@ def test_nearest_against_sorting(count: int) -> None:
     assert (expected == np.arange(300)[:, None]).any(axis=1).all()
 
 
+@pytest.mark.parametrize("group", [1, 4, 64])
+def test_nearest_of_words_that_float32_cannot_order(monkeypatch: pytest.MonkeyPatch, group: int) -> None:
+    """Signed words of large norm in nearly the same direction. Control: if scores excluded too much, words would be missing."""
+    rng = np.random.default_rng(0)
+    codes = rng.integers(-300, 300, size=128)[None] + rng.integers(-1, 2, size=(400, 128))
+    codes = np.concatenate([codes, -codes[:100]]).astype(np.int16)
+    table = cosines(codes)
+    np.fill_diagonal(table, 2)
+    expected = np.sort(np.argsort(-table, axis=1, kind="stable")[:, :9], axis=1)
+    monkeypatch.setattr(neighbours, "GROUP", group)
+    np.testing.assert_array_equal(Neighbours(codes).find_nearest(np.arange(500), 9), expected)
+    if group > 1:
+        return  # the bound from groups leaves room
+    monkeypatch.setattr(neighbours, "SLACK", -1e-6)
+    with pytest.raises((AssertionError, IndexError)):
+        np.testing.assert_array_equal(Neighbours(codes).find_nearest(np.arange(500), 9), expected)
+
+
 def test_levels_and_words_by_rank() -> None:
     codes, borders = words(), np.array([0.2, 0.4, 0.5, 1 - 1e-9])  # 0.5 is an end of an interval of `_Levels`
     levels = (cosines(codes)[:, :, None] >= borders).sum(axis=2)  # (K, K)

@@ -22,7 +22,7 @@ Every given defense is combined with every given attack.
 
 examples:
   bench run --defense ldp --attack dia
-  bench run --defense ldp --attack standard-2026.2
+  bench run --defense ldp --attack standard-2026.3
   bench run --defense none --defense ldp:epsilon=inf --attack dia --extractor sift:upright=false --images DIR --json
 """
 REQUIRED = ("defense",)
@@ -34,7 +34,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--attack",
         action="append",
         metavar="SPEC",
-        help="an attack, or a suite of attacks such as standard-2026.2; may be repeated",
+        help="an attack, or a suite of attacks such as standard-2026.3; may be repeated",
     )
     parser.add_argument(
         "--task", metavar="SPEC", default="reconstruction", help="the task that evaluates the releases (default: %(default)s)"
