@@ -114,7 +114,7 @@ SAMPLERS = (
     Training(
         file="flow-sift",
         defenses=("none", "affine", "ldp"),
-        steps=3600,
+        steps=4000,
         photographs="2",
         widths=NARROW,
         options=("--model", "flow", "--drafts", "shipped", "--encoding", "positions"),

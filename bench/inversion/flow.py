@@ -248,9 +248,13 @@ def guide(module: FlowNetwork, condition: Tensor, guidance: float) -> Velocity:
 
 
 def solve(velocity: Velocity, start: Tensor, times: Sequence[float]) -> Tensor:
-    """Integrate a velocity from the first to the last time by Heun's method, of second order."""
+    """Integrate a velocity from the first to the last time by Heun's method, of second order. The last step is Euler's.
+
+    It ends at the photograph that the network expects at the last but one time. So it removes noise that the network would leave.
+    """
     x = start
     for time, after in itertools.pairwise(times):
         slope = velocity(x, time)
-        x = x + (after - time) / 2 * (slope + velocity(x + (after - time) * slope, after))
+        ahead = x + (after - time) * slope
+        x = ahead if after == times[-1] else x + (after - time) / 2 * (slope + velocity(ahead, after))
     return x
