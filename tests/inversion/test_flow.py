@@ -77,7 +77,7 @@ def gaussian_velocity(x: Tensor, time: float) -> Tensor:
 def test_the_exact_velocity_transports_noise_to_gaussian_photographs() -> None:
     """Its solution is MEAN + SPREAD noise. Control: half the velocity ends elsewhere."""
     noise = torch.linspace(-2, 2, 9, dtype=torch.float64)
-    times = [warp_time(step / 400) for step in range(401)]
+    times = [warp_time(step / 1000) for step in range(1001)]
     torch.testing.assert_close(solve(gaussian_velocity, noise, times), MEAN + SPREAD * noise, atol=1e-4, rtol=0)
     other = solve(lambda x, time: gaussian_velocity(x, time) / 2, noise, times)
     assert (other - MEAN - SPREAD * noise).abs().max() > 0.1

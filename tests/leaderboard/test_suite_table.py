@@ -131,7 +131,7 @@ def test_training_samples_of_other_networks_are_not_stated(tmp_path: Path) -> No
 
 def test_training_samples_of_shipped_files() -> None:
     """Networks of every kind state them. Dictionaries are no networks."""
-    networks = ("inversion", "context", "neighbours", "positions", "line")
+    networks = ("inversion", "context", "flow", "neighbours", "positions", "line")
     for name, digest in read_digests().items():
         count = attack_cost.count_training_samples({"name": "any", "file": digest})
         assert count is not None
