@@ -100,7 +100,7 @@ another defense: {labels}.
 ![Samples of built-in photographs](../images/generative.png)
 """
 PICTURE = Path(__file__).parents[1] / "docs" / "images" / "generative.png"
-PICTURED = 3  # built-in photographs
+PICTURED = 2  # built-in photographs
 CROPS = range(0, 65, 8)  # pixels: offsets of crops of 256 pixels in a view of 320
 CONTROL = "control: crops of training photographs"
 FOUND = 0.95  # fraction of the control that the check for copies finds
@@ -319,7 +319,7 @@ def draw_samples(defenses: Sequence[Defense], attack: Generative, sources: Seque
             else:
                 row += [*images[:2], images.mean(axis=0), *prior]
     ordered = [rows[defense, number] for number in range(len(plan.samples)) for defense in defenses if (defense, number) in rows]
-    figure = Figure(figsize=(2 * max(map(len, ordered)), 2 * len(ordered)), layout="constrained")
+    figure = Figure(figsize=(1.1 * max(map(len, ordered)), 1.1 * len(ordered)), layout="constrained")
     for axes, row in zip(figure.subplots(len(ordered), max(map(len, ordered)), squeeze=False), ordered, strict=True):
         for axis in axes:
             axis.axis("off")

@@ -29,6 +29,7 @@ PLACEHOLDERS = {
     "--images": "PHOTOGRAPHS",
     "--network": "NETWORK",
     "--scene": "fox/",
+    "--training": "TRAINING",
     "--weights": "W.safetensors",
     "--work": "WORK",
 }  # option -> text for its value, a local folder

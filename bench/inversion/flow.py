@@ -193,9 +193,9 @@ def add_noise(points: Encoded, photographs: Tensor, rngs: Sequence[np.random.Gen
     noise = np.stack([rng.standard_normal((CHANNELS, *points.grid), np.float32) for rng in rngs])
     time = np.array([warp_time(rng.random()) for rng in rngs], np.float32)
     dropped = np.array([rng.random() < DROPPED for rng in rngs])
-    kept = torch.from_numpy(~dropped).float()
+    present = torch.from_numpy(~dropped).float()
     return NoisyRelease(
-        **vars(points) | {"weights": kept[points.image], "draft_weights": kept},
+        **vars(points) | {"weights": present[points.image], "draft_weights": present},
         photographs=photographs,
         noise=torch.from_numpy(noise),
         time=torch.from_numpy(time),
