@@ -19,7 +19,7 @@ from attacks import dia
 from bench.api import View
 from bench.codebook import build, dictionary
 from bench.codebook.public import ASSETS, Public
-from bench.context import encoding
+from bench.context import encoding, reconstruct
 from bench.context import weights as context_weights
 from bench.context.network import ContextModel, KeypointGraph, Shape
 from bench.context.reconstruct import encode_posteriors
@@ -322,7 +322,7 @@ def test_both_networks_are_trained_and_the_attack_loads_them(
     assert {key: found[key] for key in shipped.keys() - different} == {key: shipped[key] for key in shipped.keys() - different}
     assert found["shape"] == dataclasses.asdict(network.Shape(**shipped["shape"]))  # a later field has its default
     assert context.meta.keys() == context_weights.load(ASSETS / "context.safetensors").meta.keys()
-    for module in (dia, weights):
+    for module in (reconstruct, weights):
         monkeypatch.setattr(module, "ASSETS", tmp_path)
     public = Public()
     assert dia.DIA().explain_not_applicable(LDP(), Sift(), public) is None
