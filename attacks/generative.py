@@ -7,7 +7,8 @@ Method (`bench/inversion/flow.py`):
 
 1. Encode each keypoint of the release as `dia` does, and scatter the embeddings to a grid of cells of 4 x 4 pixels. Add the
    reconstruction of the network of `dia`, the draft, if the network was trained with drafts.
-2. Start at Gaussian noise and follow a learned velocity to a photograph, in `steps` steps of Heun's method.
+2. Start at Gaussian noise and follow a learned velocity to a photograph, in `steps` steps: of Heun's method, the last
+   one of Euler's.
 3. With `guidance` w, the velocity is u + w (v - u), for the velocity v given the release and the velocity u of the prior.
 4. Return the mean of `samples` samples.
 
@@ -56,7 +57,7 @@ class Generative(ImageAttack):
     weights: Asset = Asset("shipped")
     drafts: Asset = Asset("shipped")  # a network for drafts, if `weights` was trained with another than that of `dia`
     samples: int = 1
-    steps: int = 12  # of the solver, with two evaluations of the velocity each
+    steps: int = 12  # of the solver, with two evaluations of the velocity each, the last one with one
     guidance: float = 1.0  # 0: the prior; 1: the posterior; more: images that are likelier for this release than for others
 
     def __post_init__(self) -> None:

@@ -130,17 +130,14 @@ def main() -> None:
     parser.add_argument("--samplers", action="store_true", help="train the networks that sample photographs, after all others")
     args = parser.parse_args()
     folders = split_photographs(args.data, args.work / "photographs")
-    if args.samplers:
-        for training in SAMPLERS:
-            ship(train(training, folders, args.work, args.fraction))
-        return
-    for file, photographs, words, extractor in (*DICTIONARIES, CROSSFIT):
-        build = "dictionary", "build", "--images", folders[photographs], "--size", words, "--extractor", extractor
-        run_once(args.work / f"{file}.safetensors", *build)
-    for file, *_ in DICTIONARIES:
-        ship(args.work / f"{file}.safetensors")
-    train(FIRST, folders, args.work, args.fraction)
-    for training in TRAININGS:
+    if not args.samplers:
+        for file, photographs, words, extractor in (*DICTIONARIES, CROSSFIT):
+            build = "dictionary", "build", "--images", folders[photographs], "--size", words, "--extractor", extractor
+            run_once(args.work / f"{file}.safetensors", *build)
+        for file, *_ in DICTIONARIES:
+            ship(args.work / f"{file}.safetensors")
+        train(FIRST, folders, args.work, args.fraction)
+    for training in SAMPLERS if args.samplers else TRAININGS:
         ship(train(training, folders, args.work, args.fraction))
 
 
