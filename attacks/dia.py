@@ -9,7 +9,7 @@ Method:
 2. The network reconstructs the photograph from the encoded keypoints. For word sets, the context model of the attack `context`
    first computes the posterior of each candidate, and the network weighs the candidates by it.
 3. If the extractor declares how descriptors change when the photograph is mirrored or rotated, repeat both steps for all eight
-   symmetries and average the reconstructions.
+   symmetries and average the reconstructions. The posterior is the same for all: the geometric mean of those in two symmetries.
 
 Knowledge: a network trained on public photographs for that distribution of releases. With undefended descriptors the result is
 the upper bound, the paper's row "Raw".

@@ -29,7 +29,7 @@ DICTIONARIES = (  # file, set of photographs, words, extractor
 # A dictionary for photographs that a shipped dictionary was built from; not shipped.
 CROSSFIT = ("crossfit-xfeat", "2", 16_000, "xfeat")
 SETS = ("01", "02", "12", "2", "012")  # of thirds of the photographs
-NARROW, SMALL = "32,64,112,56", "24,32,48,48"  # widths
+NARROW, SLIM, SMALL = "32,64,112,56", "32,48,64,64", "24,32,48,48"  # widths
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,6 +69,22 @@ TRAININGS = (
         for defense, steps in (("affine", 2000), ("ldp", 1600))
     ),
     Training(
+        file="inversion-mechanisms",
+        defenses=("plateau", "exponential", "privunit", "naive-ldp"),
+        steps=2000,
+        photographs="2",
+        widths=SLIM,
+    ),
+    Training(
+        file="inversion-liftings",
+        defenses=("affine:lifting=random", "affine:lifting=adversarial"),
+        steps=2600,
+        photographs="2",
+        initial="inversion-affine",
+        widths=SLIM,
+    ),
+    Training(file="inversion-ldp-8000", defenses=("ldp:epsilon=6.534,words=8000",), steps=2000, photographs="2", widths=SLIM),
+    Training(
         file="inversion-xfeat",
         defenses=("none", "ldp:dictionary=shipped-xfeat,words=0"),
         steps=2600,
@@ -88,7 +104,7 @@ TRAININGS = (
         defenses=("none", "ldp:dictionary=shipped-aliked,words=0"),
         steps=2600,
         photographs="2",  # its extraction is slow
-        widths="32,48,64,64",
+        widths=SLIM,
         options=(*LEARNED, ALIKED),
     ),
     *(

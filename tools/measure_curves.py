@@ -64,9 +64,9 @@ RELEASES = {  # name -> defense, extractor
     "ldp-10": ("ldp:epsilon=10", "sift"),
     "xfeat": ("none", "xfeat"),
 }
-SAMPLES = (2_000, 8_000, 24_000, 64_000)
+SAMPLES = (600, 2_000, 6_000, 20_000)
 PHOTOGRAPHS = (100, 200, 400, 800)
-FIXED = 24_000  # training samples of the curve of photographs
+FIXED = 6_000  # training samples of the curve of photographs
 AXES = {"samples": "training samples", "photographs": "training photographs"}
 LABELS = {"ssim": ("SSIM", 3), IDENTIFIED: ("identification, doublings of the rank above chance", 2)}  # metric -> label, digits
 ZEROS = {"ssim": 0.0, IDENTIFIED: LOG_RECIPROCAL_RANK}  # metric -> value that counts as zero: the mean of a random order

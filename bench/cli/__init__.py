@@ -15,6 +15,7 @@ from typing import NoReturn
 
 from bench.cli import commands
 from bench.cli.terminal import BROKEN_PIPE, FAILED, INTERRUPTED, MISTAKE, print_status, require
+from bench.core import threads
 from bench.core.errors import UserError, unknown_name
 
 RESUME = "finished records are stored; run the same command again to continue"
@@ -40,6 +41,7 @@ exit status: 0 success; 1 a sample failed (all others are written), or an audit 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status."""
+    threads.limit_spinning()
     try:
         status = _run_command(list(sys.argv[1:] if argv is None else argv))
         sys.stdout.flush()

@@ -79,13 +79,20 @@ def reconstruct_from_posteriors(
 ) -> Floats:
     """Return the mean reconstruction of a release. -> (H, W, 3) in [0, 1]
 
+    The posterior is the same in all symmetries: the geometric mean of those in the first and the last. A posterior for each of
+    the eight takes twice the time in all. It changes SSIM by .0006 ± .0009 at ε = 10 and -.0002 ± .0006 at ε = 12 (30
+    photographs for tuning, m = 2, two standard errors of the paired difference). That of the first alone changes it by -.0009 at
+    ε = 10.
+
     Parameters
     ----------
     odds : prior log odds of a candidate over none (`bench.context.encoding.prior_odds`)
     """
+    views = [symmetry.transform_release(release) for symmetry in dict.fromkeys((symmetries[0], symmetries[-1]))]
+    logs = torch.stack([compute_log_posteriors(context, view, odds) for view in views]).mean(dim=0).log_softmax(dim=1)
 
     def encode_one(transformed: WordSets) -> EncodedRelease:
-        return encode_posteriors(transformed, compute_log_posteriors(context, transformed, odds), odds)
+        return encode_posteriors(transformed, logs, odds)
 
     return average_reconstructions(inverter, release, symmetries, encode_one)
 

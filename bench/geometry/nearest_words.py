@@ -1,16 +1,22 @@
-"""Exact search for the word of greatest cosine: a bf16 pass finds the candidates, float64 decides among them.
+"""Exact search for the word of greatest cosine: a fast pass finds the candidates, float64 decides among them.
 
-Floor: 2·N·K·D operations at the machine's bf16 matrix rate. The words are read once per batch of queries.
+The pass is in 8-bit integers, where queries and words are such and the processor multiplies them fast (`byte_search`). Otherwise
+it is in bf16 or float32.
+
+Floor: 2·N·K·D operations at the machine's matrix rate of that number format. The words are read once per batch of queries.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from bench.core.device import pick_device, pick_dtype
+from bench.geometry import byte_search
+from bench.geometry.byte_search import ByteSearch
 from bench.types import Floats, Indices, Words
 
 if TYPE_CHECKING:
@@ -35,19 +41,12 @@ class WordIndex:
     """A search index of (K, D) words, none of them zero."""
 
     def __init__(self, words: Words) -> None:
-        import torch
-
-        device = pick_device()
-        self._dtype = pick_dtype(device)
-        self._block, self._batch = (WIDE_BLOCK, WIDE_BATCH) if self._dtype == torch.float32 else (BLOCK, BATCH)
         self._words = words
-        self._coarse = torch.empty(words.shape, dtype=self._dtype, device=device)  # (K, D)
-        self._error = 0.0
-        for start in range(0, len(words), BLOCK):  # in float64, all words would take sixteen times their memory
-            exact = torch.from_numpy(unit_rows(words[start : start + BLOCK]))
-            coarse = self._coarse[start : start + BLOCK]
-            coarse.copy_(exact)
-            self._error = max(self._error, float(rounding(exact, coarse).max()))
+        self._bytes = ByteSearch(words) if byte_search.suits(words) else None
+
+    @cached_property
+    def _floats(self) -> FloatSearch:
+        return FloatSearch(self._words)
 
     def find_nearest(self, queries: Words | Floats, progress: Callable[[int], object] = lambda done: None) -> Indices:
         """Return for each query the index of the word of greatest cosine, ties to the lowest index.
@@ -61,37 +60,13 @@ class WordIndex:
         -------
         (N,) int64. Cosines are compared as dot² / |word|² in float64, in which dot products of words are exact.
         """
-        import torch
-
+        search = self._bytes if self._bytes is not None and queries.dtype == np.uint8 else self._floats
         found = np.empty(len(queries), dtype=np.int64)
-        for start in range(0, len(queries), self._batch):
-            batch = queries[start : start + self._batch]
-            exact = torch.from_numpy(unit_rows(batch))
-            coarse = exact.to(self._coarse.device, self._dtype)
-            found[start : start + self._batch] = self._decide(
-                batch, *self._find_candidates(coarse, rounding(exact, coarse) + self._error)
-            )
+        for start in range(0, len(queries), search.batch):
+            batch = queries[start : start + search.batch]
+            found[start : start + search.batch] = self._decide(batch, *search.find_candidates(batch))
             progress(len(batch))
         return found
-
-    def _find_candidates(self, queries: Tensor, errors: Tensor) -> tuple[np.ndarray, np.ndarray]:
-        """Return the pairs of a query and a word that may be its nearest. (n, D), (n,) rounding errors -> (P,), (P,)"""
-        import torch
-
-        blocks = self._coarse.split(self._block)
-        tops = torch.empty((len(blocks), len(queries)), device=queries.device)
-        for number, block in enumerate(blocks):  # a list of small tensors between the large ones would fragment the memory
-            tops[number] = block_maxima(queries, block)
-        best = tops.amax(dim=0)
-        least = best - margin(best, errors, self._dtype)  # (n,)
-        rows, words = [], []
-        for number, block in enumerate(blocks):
-            near = (tops[number] >= least).nonzero()[:, 0]
-            if len(near):
-                row, word = (queries[near] @ block.T >= least[near, None]).nonzero(as_tuple=True)
-                rows.append(near[row])
-                words.append(word + number * self._block)
-        return torch.cat(rows).cpu().numpy(), torch.cat(words).cpu().numpy()
 
     def _decide(self, queries: Words | Floats, rows: np.ndarray, words: np.ndarray) -> np.ndarray:
         """Return the candidate of greatest cosine of each query. (n, D), (P,), (P,) -> (n,)"""
@@ -102,6 +77,46 @@ class WordIndex:
         order = np.lexsort((words, -scores, rows))
         first = np.unique(rows[order], return_index=True)[1]
         return words[order][first]
+
+
+class FloatSearch:
+    """An index in the number format of fast products: bf16 or float32."""
+
+    def __init__(self, words: Words) -> None:
+        import torch
+
+        device = pick_device()
+        self._dtype = pick_dtype(device)
+        self._block, self.batch = (WIDE_BLOCK, WIDE_BATCH) if self._dtype == torch.float32 else (BLOCK, BATCH)
+        self._coarse = torch.empty(words.shape, dtype=self._dtype, device=device)  # (K, D)
+        self._error = 0.0
+        for start in range(0, len(words), BLOCK):  # in float64, all words would take sixteen times their memory
+            exact = torch.from_numpy(unit_rows(words[start : start + BLOCK]))
+            coarse = self._coarse[start : start + BLOCK]
+            coarse.copy_(exact)
+            self._error = max(self._error, float(rounding(exact, coarse).max()))
+
+    def find_candidates(self, rows: Words | Floats) -> tuple[Indices, Indices]:
+        """Return the pairs of a query and a word that may be its nearest. (n, D) -> (P,), (P,)"""
+        import torch
+
+        exact = torch.from_numpy(unit_rows(rows))
+        queries = exact.to(self._coarse.device, self._dtype)
+        errors = rounding(exact, queries) + self._error  # (n,)
+        blocks = self._coarse.split(self._block)
+        tops = torch.empty((len(blocks), len(queries)), device=queries.device)
+        for number, block in enumerate(blocks):  # a list of small tensors between the large ones would fragment the memory
+            tops[number] = block_maxima(queries, block)
+        best = tops.amax(dim=0)
+        least = best - margin(best, errors, self._dtype)  # (n,)
+        found, words = [], []
+        for number, block in enumerate(blocks):
+            near = (tops[number] >= least).nonzero()[:, 0]
+            if len(near):
+                row, word = (queries[near] @ block.T >= least[near, None]).nonzero(as_tuple=True)
+                found.append(near[row])
+                words.append(word + number * self._block)
+        return torch.cat(found).cpu().numpy(), torch.cat(words).cpu().numpy()
 
 
 def rounding(exact: Tensor, coarse: Tensor) -> Tensor:

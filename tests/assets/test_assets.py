@@ -16,8 +16,12 @@ from bench.inversion.reconstruct import reconstruct_image
 from bench.inversion.symmetry import find_symmetries
 from bench.inversion.train import check_quantisation
 from defenses.affine import Affine
+from defenses.exponential import Exponential
 from defenses.ldp import LDP
+from defenses.naive_ldp import NaiveLDP
 from defenses.none import Undefended
+from defenses.plateau import Plateau
+from defenses.privunit import PrivUnit
 from metrics.ssim import SSIM
 
 WORDS = ASSETS / "inversion-ldp.safetensors"  # trained longer than the others, with a context model
@@ -88,6 +92,11 @@ def test_the_network_for_words_is_trained_longer_and_follows_the_rules():
 def test_every_required_release_is_supported(public):
     defenses = [Undefended(), *(Affine(dim=dim) for dim in (2, 4, 8, 16))]
     defenses += [LDP(epsilon=epsilon, subset_size=m) for epsilon in (8.0, 10.0, 16.0) for m in (1, 2, 3, 4)]
+    defenses += [LDP(epsilon=6.534, words=8000, subset_size=m) for m in (1, 2, 4)]  # of Tables 2 and 3
+    defenses += [Affine(lifting=lifting, dim=dim) for lifting in ("random", "adversarial") for dim in (2, 4, 16)]
+    defenses += [Plateau(epsilon=epsilon) for epsilon in (8.0, 10.0, 16.0)]
+    defenses += [Exponential(epsilon=epsilon) for epsilon in (8.0, 10.0, 32.0)]
+    defenses += [PrivUnit(), PrivUnit(epsilon=32.0), NaiveLDP(), NaiveLDP(epsilon=32.0)]
     assert [DIA().explain_not_applicable(defense, Sift(), public) for defense in defenses] == [None] * len(defenses)
     assert "no adapted attacker" in (DIA().explain_not_applicable(LDP(epsilon=20), Sift(), public) or "")
 

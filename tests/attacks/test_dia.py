@@ -18,7 +18,7 @@ from bench.extractors.sift import Sift
 from bench.identification.distractors import load_distractors, rank_photograph
 from bench.images import photographs
 from bench.inversion import weights
-from bench.inversion.symmetry import IDENTITY
+from bench.inversion.symmetry import IDENTITY, find_symmetries
 from bench.threat_model import PublicAssets
 from bench.types import WordSets
 from defenses.ldp import LDP
@@ -76,6 +76,25 @@ def test_order_of_the_candidates_has_no_effect(pixels, network, context, monkeyp
     images = [reconstruct_from_posteriors(network.module, context.module, one, odds, [IDENTITY]) for one in (release, turned)]
     np.testing.assert_allclose(images[0], images[1], atol=1e-4)
     assert images[0].std() > 0.1
+
+
+def test_the_reconstruction_of_the_mirrored_release_is_mirrored(pixels, network, context, monkeypatch):
+    """In float32. Control: the posteriors of the two views differ, so that of one alone would not do."""
+    monkeypatch.setattr("bench.inversion.reconstruct.pick_dtype", lambda device: torch.float32)
+    defense = LDP(epsilon=10.0)
+    release = release_photograph(pixels, defense)
+    mirror = find_symmetries(Sift())[1]
+    odds = prior_odds(defense, Public(), release.subset_size)
+
+    def reconstruct(one: WordSets) -> np.ndarray:
+        return reconstruct_from_posteriors(network.module, context.module, one, odds, [IDENTITY, mirror])
+
+    mirrored = reconstruct(mirror.transform_release(release))[:, ::-1]
+    assert mirror.mirrored
+    assert not mirror.turns
+    np.testing.assert_allclose(reconstruct(release), mirrored, atol=1e-3)
+    logs = [compute_log_posteriors(context.module, one, odds) for one in (release, mirror.transform_release(release))]
+    assert (logs[0] - logs[1]).abs().max() > 0.1
 
 
 def test_a_candidate_of_posterior_zero_has_no_effect(pixels, network):

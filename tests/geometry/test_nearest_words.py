@@ -7,10 +7,19 @@ import faiss
 import numpy as np
 import pytest
 import torch
-from floor import build_bare_product
+from floor import build_bare_product, build_byte_product
 
-from bench.geometry import nearest_words
+from bench.core.device import has_byte_products
+from bench.geometry import byte_search, nearest_words
 from bench.geometry.nearest_words import WordIndex, unit_rows
+
+in_both = pytest.mark.parametrize("bytewise", [True, False], ids=["bytes", "floats"], indirect=True)
+
+
+@pytest.fixture
+def bytewise(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Search in 8-bit integers, or not, whatever this machine does fast."""
+    monkeypatch.setattr(byte_search, "suits", lambda words: request.param and words.dtype == np.uint8)
 
 
 def nearest_rows(queries: np.ndarray, words: np.ndarray) -> np.ndarray:
@@ -27,7 +36,8 @@ def words(rng):
     return rng.integers(0, 200, (5000, 128), dtype=np.uint8)
 
 
-def test_agrees_with_brute_force(rng, words):
+@in_both
+def test_agrees_with_brute_force(rng, words, bytewise):
     queries = rng.integers(0, 200, (700, 128), dtype=np.uint8)
     assert np.array_equal(nearest_rows(queries, words), brute_force(queries, words))
 
@@ -40,7 +50,8 @@ def test_agrees_with_faiss_on_floats(rng, words):
 
 
 @pytest.mark.slow
-def test_words_that_bf16_cannot_distinguish(rng):
+@in_both
+def test_words_that_bf16_cannot_distinguish(rng, bytewise):
     """The words differ by one step in one component, so only an exact comparison finds the right one."""
     base = rng.integers(100, 156, 128, dtype=np.uint8)
     words = np.repeat(base[None], 4096, axis=0)
@@ -50,7 +61,8 @@ def test_words_that_bf16_cannot_distinguish(rng):
 
 
 @pytest.mark.slow
-def test_without_a_margin_it_would_be_wrong(rng, monkeypatch):
+@pytest.mark.parametrize("bytewise", [False], indirect=True)
+def test_without_a_margin_it_would_be_wrong(rng, monkeypatch, bytewise):
     """Negative control of the tests above: the first pass alone does not decide."""
     base = rng.integers(0, 120, 128)
     words, queries = (
@@ -62,21 +74,47 @@ def test_without_a_margin_it_would_be_wrong(rng, monkeypatch):
     assert not np.array_equal(nearest_rows(queries, words), brute_force(queries, words))
 
 
-def test_ties_go_to_the_lowest_index(words):
+@in_both
+def test_words_of_any_norm(rng, words, bytewise):
+    """Control for integers: without the norms, long words win."""
+    scaled = np.maximum(words * rng.uniform(0.02, 1, (len(words), 1)), 1).astype(np.uint8)
+    queries = np.concatenate([scaled[::9], rng.integers(0, 200, (300, 128), dtype=np.uint8)])
+    index, expected = WordIndex(scaled), brute_force(queries, scaled)
+    assert np.array_equal(index.find_nearest(queries), expected)
+    if index._bytes is not None:
+        index._bytes._limits[:] = index._bytes._inverse[:] = 1
+        assert not np.array_equal(index.find_nearest(queries), expected)
+
+
+@in_both
+def test_a_zero_query_gets_the_first_word(words, bytewise):
+    assert nearest_rows(np.zeros((2, 128), np.uint8), words).tolist() == [0, 0]
+
+
+@in_both
+def test_extreme_components(bytewise):
+    words = np.array([[255] * 128, [0] * 127 + [255], [0] * 127 + [1], [255] * 127 + [0]], dtype=np.uint8)
+    assert nearest_rows(words, words).tolist() == [0, 1, 1, 3]
+
+
+@in_both
+def test_ties_go_to_the_lowest_index(words, bytewise):
     doubled = np.concatenate([words, words])  # each word occurs twice, in different blocks
     found = nearest_rows(words[:300], doubled)
     assert (found < len(words)).all()
 
 
-def test_a_longer_multiple_is_the_same_direction():
+@in_both
+def test_a_longer_multiple_is_the_same_direction(bytewise):
     words = np.zeros((3, 128), dtype=np.uint8)
     words[0, 0], words[1, 1], words[2, 0] = 10, 10, 250
-    query = np.zeros((1, 128), dtype=np.float32)
+    query = np.zeros((1, 128))
     query[0, 0] = 3.5
-    assert nearest_rows(query, words)[0] == 0
+    assert nearest_rows(query.astype(np.float32), words)[0] == nearest_rows(query.astype(np.uint8), words)[0] == 0
 
 
-def test_memory_of_building_does_not_grow_with_the_words():
+@in_both
+def test_memory_of_building_does_not_grow_with_the_words(bytewise):
     words = np.ones((50_000, 128), dtype=np.uint8)
     tracemalloc.start()
     WordIndex(words)
@@ -85,7 +123,8 @@ def test_memory_of_building_does_not_grow_with_the_words():
     assert peak < words.nbytes * 2  # all words in float64 at once would be eight times theirs
 
 
-def test_no_queries(words):
+@in_both
+def test_no_queries(words, bytewise):
     assert nearest_rows(np.empty((0, 128), np.uint8), words).shape == (0,)
 
 
@@ -111,6 +150,13 @@ def flat(words: np.ndarray) -> faiss.IndexFlatIP:
 def test_speed_of_the_bare_product(benchmark, many, dtype):
     queries, words = many
     benchmark(build_bare_product(len(queries), words, dtype))
+
+
+@speed
+@pytest.mark.skipif(not has_byte_products(), reason="8-bit products are slow here")
+def test_speed_of_the_bare_product_in_bytes(benchmark, many):
+    queries, words = many
+    benchmark(build_byte_product(len(queries), words))
 
 
 @speed

@@ -25,7 +25,7 @@ def list_differences(training: Training) -> Iterator[str]:
     """Yield what differs between a training and the metadata of the shipped file."""
     meta = weights.load(ASSETS / f"{training.file}.safetensors").meta
     options = dict(zip(training.options[::2], training.options[1::2], strict=True))
-    if sorted(text.partition(":")[0] for text in training.defenses) != weights.list_defenses(meta):
+    if sorted({text.partition(":")[0] for text in training.defenses}) != weights.list_defenses(meta):
         yield "defenses"
     widths = [int(width) for width in training.widths.split(",")] if training.widths else list(Shape.widths)
     if widths != meta["shape"]["widths"]:
