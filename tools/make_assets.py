@@ -83,7 +83,6 @@ TRAININGS = (
         initial="inversion-affine",
         widths=SLIM,
     ),
-    Training(file="inversion-ldp-8000", defenses=("ldp:epsilon=6.534,words=8000",), steps=2000, photographs="2", widths=SLIM),
     Training(
         file="inversion-xfeat",
         defenses=("none", "ldp:dictionary=shipped-xfeat,words=0"),

@@ -74,7 +74,7 @@ SMOKE = Profile(
 )
 CPU = Profile(
     name="cpu",
-    photographs=16,
+    photographs=100,
     builtin=None,
     figure_photographs=3,
     scale=0.5,
