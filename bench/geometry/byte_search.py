@@ -1,6 +1,6 @@
 """Search for the word of greatest cosine in 8-bit integers, whose products are exact.
 
-Processors with instructions for such products (VNNI, AMX) multiply them about four times as fast as float32. The products have
+Processors with instructions for such products (VNNI) compute them about four times as fast as those in float32. The products have
 signed factors, so 128 is subtracted from all components:
 
     q·w = (q − 128)·(w − 128) + 128 (Σ q + Σ w) − 128² D
@@ -43,11 +43,8 @@ class ByteSearch:
         ordered = words[self._order]
         self._sums = torch.from_numpy((OFFSET * ordered.sum(axis=1, dtype=np.int64)).astype(np.int32))  # (K,)
         self._words = _shift(ordered, out=ordered)
-        inverse = torch.from_numpy(1 / norms[self._order])
-        self._inverse = inverse.float()
-        self._limits = torch.tensor(
-            [(float(block[-1]), float(block[0])) for block in inverse.split(BLOCK)]
-        )  # (blocks, 2) ascending
+        self._inverse = torch.from_numpy(1 / norms[self._order]).float()  # (K,), descending
+        self._limits = torch.stack([block[[-1, 0]] for block in self._inverse.split(BLOCK)])  # (blocks, 2): least, greatest
 
     def find_candidates(self, rows: Words | Floats) -> tuple[Indices, Indices]:
         """Return the pairs of a query and a word that may be its nearest. (n, D) uint8 -> (P,), (P,)"""
@@ -61,7 +58,7 @@ class ByteSearch:
         for number, (words, offsets, _) in enumerate(blocks):
             torch.amax(torch._int_mm(shifted, words.T).add_(offsets), dim=1, out=greatest[number])
         dots = (greatest + sums).double()  # (blocks, n), exact and not negative
-        low, high = self._limits.T[:, :, None]
+        low, high = self._limits.T[:, :, None]  # (blocks, 1) twice
         least = (dots * low).amax(dim=0) * (1 - SLACK)  # (n,)
         near_rows, found = [], []
         for number, ((words, offsets, inverse), near) in enumerate(zip(blocks, dots * high >= least, strict=True)):
