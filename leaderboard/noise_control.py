@@ -1,8 +1,8 @@
 """Matched-noise control: whether a defense leaks less than Gaussian noise on raw descriptors at the same utility.
 
-The control of a defense is the setting of the defense `noise` whose utility is nearest to its own, and at most `TOLERANCE`
-away. The utility is the recall of localization, or else the matching score: the recall of the task `matching`. Both are
-measured for both defenses in one comparison group of the same features. `tools/match_noise.py` finds such settings.
+The control of a defense is the setting of the defense `noise` whose utility is nearest to its own, and counts as equal to it
+(`get_tolerance`). The utility is the recall of localization, or else the matching score: the recall of the task `matching`. Both
+are measured for both defenses in one comparison group of the same features. `tools/match_noise.py` finds such settings.
 
 The leakage of a defense, and of the noise, is the greatest mean over its attacks in the group, baselines included, oracles
 excluded. The two are paired by sample and compared by Student's t in both directions, with Holm's correction over all comparisons
@@ -26,7 +26,7 @@ from leaderboard.worst_case import SuiteResult, WorstCase, find_worst
 
 CONTROL = "noise"  # the name of the defense
 ADAPTED = "dia"  # the attack whose network is trained for a defense
-TOLERANCE = 0.02  # greatest difference of the utilities
+TOLERANCE, RELATIVE = 0.02, 0.2  # greatest difference of the utilities, and as a fraction of the defense's
 LESS, MORE, NOT_LESS = "leaks less than noise", "leaks more than noise", "not shown to leak less than noise"
 
 
@@ -138,10 +138,15 @@ def find_control(group: ComparisonGroup, groups: Sequence[ComparisonGroup], resu
             if (score := _average_utility(utility.group, utility.measure, each[0].metadata["defense"])) is not None
         }
         label = min(others, key=lambda label: abs(others[label] - utility.mean), default=None)
-        if label is not None and abs(others[label] - utility.mean) <= TOLERANCE:
+        if label is not None and abs(others[label] - utility.mean) <= get_tolerance(utility.mean):
             utilities = utility.mean, others[label]
             return Control(label=label, utility=utility.measure, utilities=utilities, experiments=tuple(noises[label]))
     return None
+
+
+def get_tolerance(utility: float) -> float:
+    """Return the greatest difference at which the utility of noise counts as equal to that of a defense."""
+    return min(TOLERANCE, RELATIVE * utility)
 
 
 def find_utility(group: ComparisonGroup, groups: Sequence[ComparisonGroup], defense: dict[str, object]) -> Utility | None:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from bench.core.hashing import canonical_json
 from bench.core.table import NOT_APPLICABLE, Column, Row, Table
 from bench.runner.records import Record
 from leaderboard import chance
@@ -82,7 +83,8 @@ def build_group_tables(
 ) -> dict[str, Table]:
     """Return the table `defenses` with a row for each defense, and `worst-case` with one for each measure. {} without results.
 
-    `groups` may hold the utilities of the defenses. A `brief` table of worst cases has the measures that rank defenses alone.
+    `groups` may hold the utilities of the defenses. `brief` tables show a defense under the latest suite that it has all results
+    of, and not also under earlier ones; the one of worst cases has the measures that rank defenses alone.
     """
     return _build_tables(group, list_results(group), groups, brief)
 
@@ -101,10 +103,15 @@ def build_run_tables(records: Sequence[Record], *, brief: bool = False) -> list[
 def _build_tables(
     group: ComparisonGroup, every: Sequence[SuiteResult], groups: Sequence[ComparisonGroup], brief: bool
 ) -> dict[str, Table]:
-    judgement = _judge(group, every, groups)
+    judgement = _judge(group, _select_latest(every) if brief else every, groups)
     if not judgement.results:
         return {}
     return {"defenses": _build_defenses(judgement, groups), "worst-case": _build_worst_cases(judgement, brief)}
+
+
+def _select_latest(results: Sequence[SuiteResult]) -> list[SuiteResult]:
+    """Return the last result of each defense."""
+    return list({canonical_json(result.metadata["defense"]): result for result in results}.values())
 
 
 def _judge(group: ComparisonGroup, every: Sequence[SuiteResult], groups: Sequence[ComparisonGroup]) -> _Judgement:

@@ -11,6 +11,7 @@ shows the control on each row.
 from __future__ import annotations
 
 import argparse
+import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,7 +28,7 @@ from bench.runner.records import Record
 from bench.tasks.matching import Matching
 from defenses.noise import Noise
 from leaderboard.comparison import LocatedRecord, build_groups
-from leaderboard.noise_control import TOLERANCE
+from leaderboard.noise_control import get_tolerance
 from leaderboard.suite_table import build_group_tables
 
 TITLE = """# Matched-noise control
@@ -43,8 +44,8 @@ UNADAPTED = (
     "ones, and the baselines. An adapted network may find more. So no defense has the flag *leaks more than noise* here."
 )
 SCORE = "recall"  # of the task `matching`
-LARGEST = 4.0  # sigma; at it hardly any descriptor finds its match
-EVALUATIONS = 10  # of the matching score, for each defense
+LARGEST = 16.0  # sigma; at it hardly any descriptor finds its match
+EVALUATIONS = 14  # of the matching score, for each defense
 DENOISE = tuple(f"denoise:estimate={estimate}" for estimate in ("released", "word", "mean"))
 
 
@@ -72,7 +73,7 @@ class Match:
     @property
     def is_close(self) -> bool:
         """Whether the scores are equal within the tolerance of the leaderboard."""
-        return self.difference <= TOLERANCE
+        return self.difference <= get_tolerance(self.target.score)
 
 
 def main() -> None:
@@ -106,6 +107,7 @@ def measure(
     """
     utilities: list[Record] = []
 
+    @functools.cache  # noise of one sigma is measured once, for all defenses
     def match(defense: Defense) -> Utility:
         records = bench.run([defense], task=Matching(each=each), extractor=extractor, out=work / "utility")
         utilities.extend(records)
@@ -150,7 +152,7 @@ def find_sigma(target: Utility, match: Callable[[float], Utility]) -> Match:
     low, high = 0.0, LARGEST
     matches = [Match(sigma=sigma, noise=match(sigma), target=target) for sigma in (low, high)]
     if matches[1].noise.score < target.score < matches[0].noise.score:
-        while len(matches) < EVALUATIONS and matches[-1].difference > TOLERANCE / 2:
+        while len(matches) < EVALUATIONS and matches[-1].difference > get_tolerance(target.score) / 2:
             middle = (low + high) / 2
             matches.append(Match(sigma=middle, noise=match(middle), target=target))
             low, high = (middle, high) if matches[-1].noise.score > target.score else (low, middle)

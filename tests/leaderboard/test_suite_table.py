@@ -284,8 +284,11 @@ def test_table_shows_version_attack_baselines_and_flags(tmp_path: Path) -> None:
 def test_a_run_of_the_newest_version_has_the_older_one_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """So it can be compared with the rows of the older version."""
     monkeypatch.setattr(attack_suite, "list_attack_suites", lambda: [STANDARD, NEWEST])
-    results = list_results(build_group(tmp_path / "new", run_suite(suite=NEWEST)))
-    assert [result.version for result in results] == [STANDARD, NEWEST]
+    group = build_group(tmp_path / "new", run_suite(suite=NEWEST))
+    assert [result.version for result in list_results(group)] == [STANDARD, NEWEST]
+    shown, terminal = (build_group_tables(group, brief=brief)["worst-case"] for brief in (False, True))
+    assert {row.values["suite"] for row in shown.rows} == {STANDARD, NEWEST}
+    assert {row.values["suite"] for row in terminal.rows} == {NEWEST}
     (older,) = list_results(build_group(tmp_path / "old", run_suite()))
     assert older.version == STANDARD
 

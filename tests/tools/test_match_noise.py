@@ -12,7 +12,7 @@ from match_noise import EVALUATIONS, LARGEST, Utility, find_sigma, format_matche
 
 from bench.cache import store
 from bench.extractors.sift import Sift
-from leaderboard.noise_control import TOLERANCE
+from leaderboard.noise_control import get_tolerance
 from leaderboard.provenance import list_stale
 
 
@@ -30,12 +30,12 @@ def count(calls: list[float]) -> Callable[[float], Utility]:
     return match
 
 
-@pytest.mark.parametrize("target", [0.7, 0.4, 0.1])
+@pytest.mark.parametrize("target", [0.7, 0.4, 0.1, 0.003])
 def test_bisection_finds_the_score_in_few_evaluations(target: float) -> None:
     calls: list[float] = []
     found = find_sigma(reach(target), count(calls))
     assert found.is_close
-    assert abs(found.noise.score - target) <= TOLERANCE / 2
+    assert abs(found.noise.score - target) <= get_tolerance(target) / 2
     assert len(calls) <= EVALUATIONS
     assert find_sigma(reach(target), count([])) == found
 
