@@ -7,9 +7,10 @@ Method:
 1. Encode each keypoint of the release: the descriptor, the m words, or the parameters of the subspace. The random origin and
    basis of a subspace are noise and no part of the encoding `invariant` (`bench/inversion/encoding.py`).
 2. The network reconstructs the photograph from the encoded keypoints. For word sets, the context model of the attack `context`
-   first computes the posterior of each candidate, and the network weighs the candidates by it.
-3. If the extractor declares how descriptors change when the photograph is mirrored or rotated, repeat both steps for all eight
-   symmetries and average the reconstructions. The posterior is the same for all: the geometric mean of those in two symmetries.
+   first computes the posterior of each candidate, and the network weighs the candidates by it. The posterior is the geometric
+   mean of those in two symmetries of step 3.
+3. If the extractor declares how descriptors change when the photograph is mirrored or rotated, encode and reconstruct in all
+   eight symmetries, with the same posterior, and average the reconstructions.
 
 Knowledge: a network trained on public photographs for that distribution of releases. With undefended descriptors the result is
 the upper bound, the paper's row "Raw".

@@ -6,6 +6,7 @@ recall of localization is nearest to `FIXED_RECALL`.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -92,7 +93,7 @@ def build_group_tables(
 def build_run_tables(records: Sequence[Record], *, brief: bool = False) -> list[Table]:
     """Return both tables of each group of a run whose records have every attack of a suite for at least one defense.
 
-    `brief` tables are for a terminal: they have the measures that rank defenses alone.
+    `brief` tables are for a terminal, as in `build_group_tables`.
     """
     groups = build_groups([LocatedRecord(record, Path()) for record in records])
     results = [(group, list_results(group)) for group in groups]
@@ -103,9 +104,11 @@ def build_run_tables(records: Sequence[Record], *, brief: bool = False) -> list[
 def _build_tables(
     group: ComparisonGroup, every: Sequence[SuiteResult], groups: Sequence[ComparisonGroup], brief: bool
 ) -> dict[str, Table]:
-    judgement = _judge(group, _select_latest(every) if brief else every, groups)
+    judgement = _judge(group, every, groups)
     if not judgement.results:
         return {}
+    if brief:  # flags compare the results of all defenses under a suite, shown or not
+        judgement = dataclasses.replace(judgement, results=_select_latest(judgement.results))
     return {"defenses": _build_defenses(judgement, groups), "worst-case": _build_worst_cases(judgement, brief)}
 
 

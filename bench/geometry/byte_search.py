@@ -10,6 +10,7 @@ Floor: 2·N·K·D operations at the machine's 8-bit matrix rate.
 
 from __future__ import annotations
 
+import functools
 from typing import TYPE_CHECKING, TypeGuard, cast
 
 import numpy as np
@@ -84,5 +85,23 @@ def _compute_norms(rows: Bytes) -> NDArray[np.float64]:
 
 
 def suits(words: Words) -> TypeGuard[Bytes]:
-    """Return whether words can be searched in integers, and whether this machine does it fast."""
-    return words.dtype == np.uint8 and pick_device().type == "cpu" and has_byte_products()
+    """Return whether words can be searched in integers: this machine multiplies such integers fast, and exactly."""
+    return words.dtype == np.uint8 and pick_device().type == "cpu" and has_byte_products() and is_exact(words.shape[1])
+
+
+@functools.cache
+def is_exact(length: int) -> bool:
+    """Return whether products of integers are exact for vectors of this length.
+
+    Without VNNI the library adds pairs of products in 16 bits, which saturate. The processor's flags do not tell: the environment
+    can keep the library from these instructions (`ONEDNN_MAX_CPU_ISA`).
+    """
+    import torch
+
+    if not torch.backends.mkldnn.is_available():
+        return False
+    rng = np.random.default_rng(0)
+    queries, words = (rng.integers(-128, 128, (rows, length), dtype=np.int8) for rows in (64, 256))
+    queries[:2], words[:2] = [[127], [-128]], [[127], [-128]]  # the greatest products
+    found = torch._int_mm(torch.from_numpy(queries), torch.from_numpy(words).T).numpy()
+    return np.array_equal(found, queries.astype(np.int32) @ words.astype(np.int32).T)

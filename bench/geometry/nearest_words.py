@@ -61,11 +61,12 @@ class WordIndex:
         (N,) int64. Cosines are compared as dot² / |word|² in float64, in which dot products of words are exact.
         """
         search = self._bytes if self._bytes is not None and queries.dtype == np.uint8 else self._floats
-        found = np.empty(len(queries), dtype=np.int64)
-        for start in range(0, len(queries), search.batch):
-            batch = queries[start : start + search.batch]
-            found[start : start + search.batch] = self._decide(batch, *search.find_candidates(batch))
-            progress(len(batch))
+        found = np.zeros(len(queries), dtype=np.int64)
+        directed = np.flatnonzero(queries.any(axis=1))  # for a row of zeros all words tie, and the first is found
+        for start in range(0, len(directed), search.batch):
+            rows = directed[start : start + search.batch]
+            found[rows] = self._decide(queries[rows], *search.find_candidates(queries[rows]))
+            progress(len(rows))
         return found
 
     def _decide(self, queries: Words | Floats, rows: np.ndarray, words: np.ndarray) -> np.ndarray:

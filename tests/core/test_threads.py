@@ -22,12 +22,12 @@ def test_the_environment_of_the_user_decides_how_threads_wait(
     given: dict[str, str], expected: str | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for variable in ("OMP_WAIT_POLICY", threads.SPINS):
-        monkeypatch.delenv(variable, raising=False)
+        monkeypatch.setenv(variable, "")  # so that the end of the test restores it
+        monkeypatch.delenv(variable)
     for variable, value in given.items():
         monkeypatch.setenv(variable, value)
     threads.limit_spinning()
     assert os.environ.get(threads.SPINS) == expected
-    monkeypatch.delenv(threads.SPINS, raising=False)
 
 
 def test_a_command_sets_it_before_torch_is_imported() -> None:

@@ -1,5 +1,8 @@
 """The exact search for the nearest word, against brute force in float64 and against faiss."""
 
+import os
+import subprocess
+import sys
 import timeit
 import tracemalloc
 
@@ -19,6 +22,8 @@ in_both = pytest.mark.parametrize("bytewise", [True, False], ids=["bytes", "floa
 @pytest.fixture
 def bytewise(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Search in 8-bit integers, or not, whatever this machine does fast."""
+    if request.param and not byte_search.is_exact(128):
+        pytest.skip("products of 8-bit integers saturate here")
     monkeypatch.setattr(byte_search, "suits", lambda words: request.param and words.dtype == np.uint8)
 
 
@@ -38,8 +43,11 @@ def words(rng):
 
 @in_both
 def test_agrees_with_brute_force(rng, words, bytewise):
-    queries = rng.integers(0, 200, (700, 128), dtype=np.uint8)
-    assert np.array_equal(nearest_rows(queries, words), brute_force(queries, words))
+    for queries, searched in (
+        (rng.integers(0, 200, (700, 128), dtype=np.uint8), words),
+        (rng.integers(0, 256, (300, 128), dtype=np.uint8), rng.integers(0, 256, (3000, 128), dtype=np.uint8)),
+    ):
+        assert np.array_equal(nearest_rows(queries, searched), brute_force(queries, searched))
 
 
 def test_agrees_with_faiss_on_floats(rng, words):
@@ -86,9 +94,34 @@ def test_words_of_any_norm(rng, words, bytewise):
         assert not np.array_equal(index.find_nearest(queries), expected)
 
 
+@pytest.mark.slow
+def test_products_that_saturate_are_not_used():
+    """The library may be kept from the instructions that the processor has. Control: its products are wrong then."""
+    code = (
+        "import numpy as np, torch\n"
+        "from bench.core.device import has_byte_products\n"
+        "from bench.geometry import byte_search\n"
+        "from bench.geometry.nearest_words import WordIndex\n"
+        "rng = np.random.default_rng(0)\n"
+        "queries, words = (rng.integers(0, 256, (count, 128), dtype=np.uint8) for count in (300, 3000))\n"
+        "units = words / np.linalg.norm(words.astype(float), axis=1, keepdims=True)\n"
+        "exact = (queries.astype(float) @ units.T).argmax(axis=1)\n"
+        "print((WordIndex(words).find_nearest(queries) == exact).all(), byte_search.is_exact(128))\n"
+        "byte_search.suits = lambda words: True\n"
+        "print((WordIndex(words).find_nearest(queries) == exact).all())\n"
+    )
+    environment = os.environ | {"ONEDNN_MAX_CPU_ISA": "AVX2"}
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True)
+    assert ended.stdout.split() in (["True", "False", "False"], ["True", "True", "True"])
+
+
 @in_both
-def test_a_zero_query_gets_the_first_word(words, bytewise):
-    assert nearest_rows(np.zeros((2, 128), np.uint8), words).tolist() == [0, 0]
+def test_zero_queries_get_the_first_word(words, bytewise):
+    queries = np.zeros((3000, 128), np.uint8)
+    queries[1500] = words[7]
+    found = nearest_rows(queries, words)
+    assert found[1500] == 7
+    assert not np.delete(found, 1500).any()
 
 
 @in_both

@@ -21,11 +21,18 @@ THIRDS = {"2": 266, "012": 800}  # photographs of a set, in thirds
 ALL = (*TRAININGS, *SAMPLERS)
 
 
+def name_defense(text: str) -> str:
+    """Return the name of a defense, and how it lifts, if it does."""
+    defense = spec.read(text, discovery.DEFENSE)
+    return f"{defense.name()}:{getattr(defense, 'lifting', '')}"
+
+
 def list_differences(training: Training) -> Iterator[str]:
     """Yield what differs between a training and the metadata of the shipped file."""
     meta = weights.load(ASSETS / f"{training.file}.safetensors").meta
     options = dict(zip(training.options[::2], training.options[1::2], strict=True))
-    if sorted({text.partition(":")[0] for text in training.defenses}) != weights.list_defenses(meta):
+    trained = [meta["defense"], *(other["defense"] for other in meta.get("others", []))]
+    if sorted(map(name_defense, training.defenses)) != sorted(f"{each['name']}:{each.get('lifting', '')}" for each in trained):
         yield "defenses"
     widths = [int(width) for width in training.widths.split(",")] if training.widths else list(Shape.widths)
     if widths != meta["shape"]["widths"]:
@@ -61,6 +68,9 @@ def test_differences_are_found() -> None:
     wrong = {"defenses": ("affine",), "widths": "8,8", "photographs": "012"}
     for field, value in wrong.items():
         assert list(list_differences(dataclasses.replace(first, **{field: value}))) == [field]
+    liftings = next(training for training in ALL if training.file == "inversion-liftings")
+    equal = dataclasses.replace(liftings, defenses=("affine:lifting=random", "affine:lifting=random"))
+    assert list(list_differences(equal)) == ["defenses"]
     more = {
         "--encoding positions": "encoding",
         "--extractor xfeat": "extractor",
