@@ -57,7 +57,7 @@ class ByteSearch:
         blocks = list(zip(self._words.split(BLOCK), self._sums.split(BLOCK), self._inverse.split(BLOCK), strict=True))
         greatest = torch.empty((len(blocks), len(queries)), dtype=torch.int32)
         for number, (words, offsets, _) in enumerate(blocks):
-            torch.amax(torch._int_mm(shifted, words.T).add_(offsets), dim=1, out=greatest[number])
+            torch.amax(_multiply(shifted, words, offsets), dim=1, out=greatest[number])
         dots = (greatest + sums).double()  # (blocks, n), exact and not negative
         low, high = self._limits.T[:, :, None]  # (blocks, 1) twice
         least = (dots * low).amax(dim=0) * (1 - SLACK)  # (n,)
@@ -65,11 +65,18 @@ class ByteSearch:
         for number, ((words, offsets, inverse), near) in enumerate(zip(blocks, dots * high >= least, strict=True)):
             if near.any():
                 queried = near.nonzero()[:, 0]
-                products = torch._int_mm(shifted[queried], words.T).add_(offsets) + sums[queried, None]
+                products = _multiply(shifted[queried], words, offsets) + sums[queried, None]
                 row, word = (products * inverse >= least[queried, None]).nonzero(as_tuple=True)
                 near_rows.append(queried[row])
                 found.append(word + number * BLOCK)
         return torch.cat(near_rows).numpy(), self._order[torch.cat(found).numpy()]
+
+
+def _multiply(queries: Tensor, words: Tensor, offsets: Tensor) -> Tensor:
+    """Return the products of integers, plus the words' own part of the correction. (n, D), (b, D), (b,) -> (n, b) int32"""
+    import torch
+
+    return torch._int_mm(queries, words.T).add_(offsets)
 
 
 def _shift(rows: Bytes, out: Bytes | None = None) -> Tensor:
