@@ -115,6 +115,17 @@ def test_products_that_saturate_are_not_used():
     assert ended.stdout.split() in (["True", "False", "False"], ["True", "True", "True"])
 
 
+@pytest.mark.parametrize("bytewise", [True], indirect=True, ids=["bytes"])
+def test_without_its_slack_the_search_in_bytes_loses_ties(monkeypatch, bytewise):
+    """Negative control: all words have one direction, and float32 rounds their quotients differently."""
+    base = np.random.default_rng(0).integers(0, 11, (1, 128)).astype(np.uint8)
+    words = base * np.arange(25, 0, -1, dtype=np.uint8)[:, None]
+    assert nearest_rows(base, words).tolist() == [0]
+    monkeypatch.setattr(byte_search, "SLACK", 0.0)
+    with pytest.raises(ValueError, match="shape"):  # no candidate is left
+        nearest_rows(base, words)
+
+
 @in_both
 def test_zero_queries_get_the_first_word(words, bytewise):
     queries = np.zeros((3000, 128), np.uint8)
