@@ -71,7 +71,7 @@ from bench.inversion.network import Inverter
 from bench.inversion.optimizer import Optimizer
 from bench.inversion.symmetry import IDENTITY
 from bench.inversion.train import check_quantisation, score
-from bench.settings import Asset
+from bench.settings import Asset, Between, OneOf
 from defenses.ldp import LDP
 
 CONTEXT_SHAPE = ContextShape(width=128, hidden=512, rank=40, neighbours=24, kernels=8)
@@ -85,6 +85,13 @@ CONSTANT = 0.6  # fraction of the steps before the rate falls
 ANCHORS = 6000  # keypoints of a batch whose pairs are used
 CHECKPOINT = "word-attacker-checkpoint"
 CHECKPOINT_SECONDS = 60.0
+TARGETS = [  # those of `draw_releases`
+    Target(defense=LDP(), supported_settings=LDP.supported_settings),
+    Target(
+        defense=LDP(dictionary=Asset("shipped-clustered")),
+        supported_settings={**LDP.supported_settings, "epsilon": Between(4.6, 12.5), "words": OneOf((8000,))},
+    ),
+]
 VALIDATED = [LDP(epsilon=epsilon, subset_size=size) for epsilon, size in ((8, 2), (10, 1), (10, 2), (10, 4), (12, 2), (16, 2))]
 RECONSTRUCTED = [LDP(epsilon=epsilon) for epsilon in (8, 10, 12)]
 
@@ -288,7 +295,7 @@ def train_context(
         ]
         print_rows(stage.name, rows)
     described = {
-        **weights.describe([Target(defense=LDP(), supported_settings=LDP.supported_settings)], Sift(), Public()),
+        **weights.describe(TARGETS, Sift(), Public()),
         **meta,
         "crops": round(PAIR_BATCH * (pair_steps + 7 / 16 * steps)),  # of releases: a half for 3/4 of the steps, else a quarter
         "batch": PAIR_BATCH,
@@ -352,7 +359,7 @@ def train_inverter(
     ]
     print_rows(stage.name, rows)
     described = {
-        **weights.describe([Target(defense=LDP(), supported_settings=LDP.supported_settings)], Sift(), Public()),
+        **weights.describe(TARGETS, Sift(), Public()),
         **meta,
         "photographs": len(meta["photographs"]),
         "encoding": "posteriors",
