@@ -60,4 +60,4 @@ def _write_figure(sample: str, records: Sequence[Record], out: Path, provenance:
     panels = figures.build_panels(original, records, [reconstruction_path(out, record) for record in records])
     metadata = PngInfo()
     metadata.add_text(CHUNK, provenance)
-    figures.draw_picture(panels, f"{sample}. {tables.SEED_REMARK}").save(figure, pnginfo=metadata, compress_level=4)
+    figures.draw_picture(panels, f"{sample}. {tables.SEED_REMARK}").save(figure, pnginfo=metadata, compress_level=2)

@@ -13,6 +13,7 @@ from bench.context.network import KeypointGraph
 from bench.types import Floats, Indices, WordSets
 
 MAX_LOG_ODDS = 20.0  # limit of the log odds in both directions
+EXACT_TREE = 4  # FLANN_INDEX_KDTREE_SINGLE, which OpenCV does not export
 
 
 def log_odds(log10_true: float, size: int) -> float:
@@ -79,13 +80,15 @@ def find_reverse_edges(neighbours: Indices, present: Floats) -> Indices:
 
 def find_nearest_keypoints(keypoints: Floats, neighbours: int) -> tuple[Indices, Floats]:
     """Return the k nearest other keypoints of each, and 1 for those that exist, else 0. (N, 2) -> (N, k), (N, k) float32"""
-    from scipy.spatial import KDTree
+    import cv2
 
     count = len(keypoints)
     available = min(neighbours, count - 1)
     nearest = np.zeros((count, neighbours), dtype=np.int64)
     if available > 0:
-        indices = KDTree(keypoints).query(keypoints, available + 1)[1]
+        points = np.ascontiguousarray(keypoints, dtype=np.float32)
+        tree = cv2.flann.Index(points, {"algorithm": EXACT_TREE})
+        indices = tree.knnSearch(points, available + 1, params={"checks": -1})[0]
         own = indices == np.arange(count)[:, None]
         own[~own.any(axis=1), -1] = True  # among more coincident keypoints than neighbours, its own may be missing
         nearest[:, :available] = indices[~own].reshape(count, available)

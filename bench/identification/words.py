@@ -96,7 +96,7 @@ def _read_words(pixels: bytes, shape: tuple[int, int, int], model: Path) -> tupl
     """Return the words of a float64 image."""
     scale, file = READER["upsampled"], io.BytesIO()
     picture = Image.fromarray(np.rint(np.frombuffer(pixels).reshape(shape) * 255).astype(np.uint8))
-    picture.resize((scale * shape[1], scale * shape[0]), Image.Resampling.BICUBIC).save(file, "PNG")
+    picture.resize((scale * shape[1], scale * shape[0]), Image.Resampling.BICUBIC).save(file, "PNG", compress_level=1)
     options = ["--tessdata-dir", str(model.parent), "-l", model.stem, "--psm", str(READER["mode"]), "-c", "tessedit_create_tsv=1"]
     done = subprocess.run(
         [PROGRAM, "stdin", "stdout", *options],

@@ -298,5 +298,5 @@ def _same(pixels: Bytes) -> Bytes:
 
 def _encode_png(image: Bytes) -> bytes:
     buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, "png", compress_level=4)  # twice as fast as 6, and 5% larger
+    Image.fromarray(image).save(buffer, "png", compress_level=2)  # three times as fast as 6, and 15% larger
     return buffer.getvalue()

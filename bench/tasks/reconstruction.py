@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from bench import scene_views
 from bench.api import Attack, Dataset, Defense, Extractor, ImageAttack, LocalMetric, Metric, PositionAttack, Selection, View
 from bench.cache import attack_cache
 from bench.codebook.public import Public
@@ -241,7 +240,11 @@ def describe_truth(metrics: Sequence[Metric], truth: Floats) -> Iterator[str]:
 def list_views(trial: Trial) -> Floats | None:
     """Return another view of the sample's scene and 255 views of others, (256, 16, 16); None if the sample has no scene."""
     index = trial.public.scene_index
-    return None if index is None else scene_views.list_candidates(trial.sample.subject, index.scene.references)
+    if index is None:
+        return None
+    from bench import scene_views  # most runs render no scene
+
+    return scene_views.list_candidates(trial.sample.subject, index.scene.references)
 
 
 def compute_part_metrics(metrics: Sequence[Metric], truth: Floats, image: Floats, mask: Mask) -> dict[str, float | None]:

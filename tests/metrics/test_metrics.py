@@ -2,6 +2,7 @@
 
 import math
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,8 @@ from scipy.integrate import trapezoid
 from skimage import metrics as reference
 
 from bench.api import Metric
+from bench.cache import store
+from bench.identification import faces
 from bench.identification.faces import compute_overlap
 from bench.images import photographs
 from metrics import angle, face, identified, l2, mae, mse, psnr, recovered, ssim
@@ -230,6 +233,21 @@ def test_faces_are_those_of_scikit_image(portrait: np.ndarray) -> None:
     rows, columns = slice(box["r"] - 12, box["r"] + box["height"] + 12), slice(box["c"] - 12, box["c"] + box["width"] + 12)
     others[rows, columns] = portrait[rows, columns]
     assert face.PLUGIN()(portrait, others) == 1.0
+
+
+def test_faces_are_cached_by_image_and_shape(
+    portrait: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    image = portrait[:96, :128].astype(np.float64)
+    with store.use_folder(tmp_path):
+        faces._detect_faces.cache_clear()
+        first = faces.detect_faces(image)
+        faces._detect_faces.cache_clear()  # as in the next command
+        monkeypatch.setattr(faces, "_apply_detector", lambda image: np.ones((1, 4)))
+        assert np.array_equal(faces.detect_faces(image), first)
+        assert len(faces.detect_faces(image.reshape(128, 96, 3))) == len(faces.detect_faces(1 - image)) == 1  # other images
+        assert len(list((tmp_path / faces.KIND).iterdir())) == 3
+    faces._detect_faces.cache_clear()
 
 
 def test_overlap_against_counted_pixels() -> None:
