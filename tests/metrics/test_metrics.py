@@ -235,9 +235,7 @@ def test_faces_are_those_of_scikit_image(portrait: np.ndarray) -> None:
     assert face.PLUGIN()(portrait, others) == 1.0
 
 
-def test_faces_are_cached_by_image_and_shape(
-    portrait: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_faces_are_cached_by_image_and_shape(portrait: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     image = portrait[:96, :128].astype(np.float64)
     with store.use_folder(tmp_path):
         faces._detect_faces.cache_clear()
