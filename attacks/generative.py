@@ -93,7 +93,7 @@ class Generative(ImageAttack):
         settings, module = network.encode_settings(view.defense, public), network.module
         assert isinstance(module, FlowNetwork)  # by the metadata
         points = encode([view.release], [settings], network.meta["slots"], network.meta["encoding"])
-        if network.meta.get("drafts"):
+        if network.meta.get("drafts") and self.guidance > 0:  # the prior reads no draft
             points = replace(points, drafts=self._draft(view, public))
         images = sample_images(module, points, self.samples, self.steps, self.guidance, rng)
         return images.permute(0, 2, 3, 1).cpu().numpy()
