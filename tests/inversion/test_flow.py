@@ -444,10 +444,7 @@ def test_bench_trains_and_runs_the_attack(tmp_path: Path, capsys: pytest.Capture
     assert bench.load_records(tmp_path / "r")["metrics.ssim"].nunique() == 3
 
 
-def test_without_a_network_it_does_not_apply(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(weights, "ASSETS", tmp_path)
-    reason = Generative().explain_not_applicable(Undefended(), Sift(), Public())
-    assert "train one with `bench train --model flow`" in str(reason)
+def test_it_does_not_apply_to_hidden_positions() -> None:
     assert "reads Points" in str(Generative().explain_not_applicable(RandomLines(), Sift(), Public()))
 
 
