@@ -23,15 +23,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from bench.api import Defense, Extractor, ImageAttack, View
 from bench.codebook.public import Public
-from bench.core.errors import UserError
 from bench.inversion.symmetry import find_symmetries
-from bench.inversion.weights import SHIPPED, Network, find_network, load
+from bench.inversion.weights import SHIPPED, AdaptedNetworks
 from bench.settings import Asset
 from bench.threat_model import PublicAssets
 from bench.types import Descriptors, Floats, Subspaces, WordSets
@@ -47,34 +45,23 @@ class DIA(ImageAttack):
     weights: Asset = Asset("shipped")
 
     def explain_incompatible(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
-        return _choose(self.weights, defense, extractor, public)[1]
+        return self._networks().explain_missing(defense, extractor, public)
 
     def assets(self, defense: Defense, extractor: Extractor, public: Public) -> Mapping[str, str]:
         from bench.context.reconstruct import verify
 
-        return {"weights": verify(self._network(defense, extractor, public))}
+        return {"weights": verify(self._networks().load(defense, extractor, public))}
 
     def reconstruct(self, view: View, rng: np.random.Generator) -> Floats:
         from bench.context.reconstruct import reconstruct_release
 
         public = view.know(PublicAssets).assets
-        network = self._network(view.defense, view.extractor, public)
+        network = self._networks().load(view.defense, view.extractor, public)
         return reconstruct_release(network, view.release, view.defense, find_symmetries(view.extractor), public)
 
-    def _network(self, defense: Defense, extractor: Extractor, public: Public) -> Network:
-        path, reason = _choose(self.weights, defense, extractor, public)
-        if path is None:
-            raise UserError(f"dia: {reason}")
-        return load(path)
-
-
-def _choose(asset: str, defense: Defense, extractor: Extractor, public: Public) -> tuple[Path | None, str | None]:
-    """Return the path of the weights for these releases, or the reason why there are none."""
-    path, details = find_network(asset, SHIPPED, defense, extractor, public)
-    if path is not None:
-        return path, None
-    command = "bench train --encoding released" if asset == "shipped-as-printed" else "bench train"
-    return None, f"no adapted attacker{details}; train one with `{command}` and pass dia:weights=FILE"
+    def _networks(self) -> AdaptedNetworks:
+        options = " --encoding released" if self.weights == "shipped-as-printed" else ""
+        return AdaptedNetworks(self.name(), self.weights, SHIPPED, options=options)
 
 
 PLUGIN = DIA

@@ -26,9 +26,8 @@ import numpy as np
 
 from bench.api import Defense, Extractor, ImageAttack, PositionAttack, View
 from bench.codebook.public import Public
-from bench.core.errors import UserError
 from bench.inversion.symmetry import find_symmetries
-from bench.inversion.weights import Network, find_network, load
+from bench.inversion.weights import AdaptedNetworks
 from bench.settings import Asset
 from bench.threat_model import PublicAssets
 from bench.types import Descriptors, Floats, Subspaces, WordSets
@@ -46,14 +45,10 @@ class DIALines(PositionAttack, ImageAttack):
     weights: Asset = Asset("shipped")
 
     def explain_incompatible(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
-        path, details = find_network(self.weights, SHIPPED, defense, extractor, public)
-        if path is not None:
-            return None
-        command = f"bench train --defense {defense.name()}"
-        return f"no adapted attacker{details}; train one with `{command}` and pass dia-lines:weights=FILE"
+        return self._networks().explain_missing(defense, extractor, public)
 
     def assets(self, defense: Defense, extractor: Extractor, public: Public) -> Mapping[str, str]:
-        return {"weights": self._network(defense, extractor, public).verify()}
+        return {"weights": self._networks().load(defense, extractor, public).verify()}
 
     def locate(self, view: View, rng: np.random.Generator) -> Floats:
         from bench.inversion.reconstruct import locate_keypoints
@@ -68,16 +63,13 @@ class DIALines(PositionAttack, ImageAttack):
     def _list_inputs(self, view: View) -> tuple[Any, ...]:
         """Return the network, the release, its symmetries, and the settings of the encoding."""
         public = view.know(PublicAssets).assets
-        network = self._network(view.defense, view.extractor, public)
+        network = self._networks().load(view.defense, view.extractor, public)
         settings = network.encode_settings(view.defense, public)
         encoding = settings, network.meta["slots"], network.meta["encoding"]
         return network.module, view.release, find_symmetries(view.extractor), *encoding
 
-    def _network(self, defense: Defense, extractor: Extractor, public: Public) -> Network:
-        path, details = find_network(self.weights, SHIPPED, defense, extractor, public)
-        if path is None:
-            raise UserError(f"dia-lines: no adapted attacker{details}")
-        return load(path)
+    def _networks(self) -> AdaptedNetworks:
+        return AdaptedNetworks(self.name(), self.weights, SHIPPED)
 
 
 PLUGIN = DIALines

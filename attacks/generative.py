@@ -35,7 +35,7 @@ from bench.api import Defense, Extractor, ImageAttack, View
 from bench.codebook.public import Public
 from bench.core.errors import UserError
 from bench.inversion.weights import SHIPPED as DRAFTS
-from bench.inversion.weights import Network, find_network, load
+from bench.inversion.weights import AdaptedNetworks, Network, find_network, load
 from bench.settings import Asset
 from bench.threat_model import PublicAssets
 from bench.types import Descriptors, Floats, Subspaces, WordSets
@@ -67,15 +67,13 @@ class Generative(ImageAttack):
             raise UserError(f"generative: guidance must be finite and at least 0, got {self.guidance}")
 
     def explain_incompatible(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
-        path, details = find_network(self.weights, SHIPPED, defense, extractor, public, model="flow")
-        if path is not None:
-            return self._explain_other_drafts(load(path), defense, extractor, public)
-        return f"no adapted attacker{details}; train one with `bench train --model flow` and pass generative:weights=FILE"
+        networks, releases = self._networks(), (defense, extractor, public)
+        return networks.explain_missing(*releases) or self._explain_other_drafts(networks.load(*releases), *releases)
 
     def assets(self, defense: Defense, extractor: Extractor, public: Public) -> Mapping[str, str]:
         from bench.context.drafts import Drafter
 
-        network = self._network(defense, extractor, public)
+        network = self._networks().load(defense, extractor, public)
         reads_drafts = bool(network.meta.get("drafts"))
         drafts = Drafter(self.drafts, extractor).digest(defense, public) if reads_drafts else UNUSED
         return {"weights": network.verify(), "drafts": drafts}
@@ -89,11 +87,11 @@ class Generative(ImageAttack):
         from bench.inversion.flow import FlowNetwork, sample_images
 
         public = view.know(PublicAssets).assets
-        network = self._network(view.defense, view.extractor, public)
+        network = self._networks().load(view.defense, view.extractor, public)
         settings, module = network.encode_settings(view.defense, public), network.module
         assert isinstance(module, FlowNetwork)  # by the metadata
         points = encode([view.release], [settings], network.meta["slots"], network.meta["encoding"])
-        if network.meta.get("drafts"):
+        if network.meta.get("drafts") and self.guidance > 0:  # the prior reads no draft
             points = replace(points, drafts=self._draft(view, public))
         images = sample_images(module, points, self.samples, self.steps, self.guidance, rng)
         return images.permute(0, 2, 3, 1).cpu().numpy()
@@ -119,11 +117,8 @@ class Generative(ImageAttack):
             return None
         return f"{name} reads drafts of another network than {path.name}; pass that one with generative:drafts=FILE"
 
-    def _network(self, defense: Defense, extractor: Extractor, public: Public) -> Network:
-        path, details = find_network(self.weights, SHIPPED, defense, extractor, public, model="flow")
-        if path is None:
-            raise UserError(f"generative: no adapted attacker{details}")
-        return load(path)
+    def _networks(self) -> AdaptedNetworks:
+        return AdaptedNetworks(self.name(), self.weights, SHIPPED, model="flow", options=" --model flow")
 
 
 PLUGIN = Generative

@@ -60,6 +60,14 @@ def draw(panels: Sequence[Panel], heading: str, columns: int = COLUMNS) -> Figur
     return figure
 
 
+def lay_out(figure: Figure) -> None:
+    """Position the axes of a figure for all formats. `savefig` draws a figure with a layout engine twice in each format."""
+    engine = figure.get_layout_engine()
+    if engine is not None:
+        engine.execute(figure)
+        figure.set_layout_engine(None)
+
+
 def draw_picture(panels: Sequence[Panel], heading: str, columns: int = COLUMNS) -> Image.Image:
     """Return a picture of the panels like `draw`, by Pillow: without the import of matplotlib, and five times as fast."""
     from PIL import ImageDraw, ImageFont, ImageOps

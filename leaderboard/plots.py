@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from bench.core.hashing import canonical_json
 from leaderboard.comparison import ComparisonGroup, GroupedExperiment
-from leaderboard.figures import escape_text
+from leaderboard.figures import escape_text, lay_out
 from leaderboard.intervals import Interval
 from leaderboard.measures import PRIVACY, RANKING, Measure, list_measures
 from leaderboard.plot_style import PlotStyle, choose_styles, position_labels
@@ -62,7 +62,7 @@ def draw_tradeoff(tradeoff: Tradeoff) -> Figure:
     axes.set_ylabel(f"{tradeoff.privacy.label} of the strongest attack →", fontsize=9)
     axes.margins(0.12)
     axes.legend(fontsize=7, frameon=False, loc="upper left", bbox_to_anchor=(1, 1))
-    figure.draw_without_rendering()  # fixes the positions of the points
+    lay_out(figure)  # fixes the positions of the points
     _write_settings(axes, tradeoff)
     return figure
 

@@ -1,4 +1,9 @@
-"""Shared by the tools that write pages in docs/results/: a cache of results, values and intervals as text, and provenance."""
+"""Shared by the tools that write pages in docs/results/: a cache of results, values and intervals as text, and provenance.
+
+A page or picture in docs/ belongs to the command in its provenance, where placeholders stand for local folders. A run with other
+options, such as a short test, writes to work/results/ instead, and prints the path. To replace the page, move the file, or remove
+the page before the run. The first command writes a page that does not exist.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +26,9 @@ from leaderboard.provenance import CHUNK, format_provenance
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-RESULTS = Path(__file__).parents[1] / "docs" / "results"
+ROOT = Path(__file__).parents[1]
+RESULTS = ROOT / "docs" / "results"
+OTHER_RESULTS = ROOT / "work" / "results"  # of commands to which no page belongs
 SMALL_GALLERY = "gallery:views=40,queries=12,rooms=2"  # a dataset for localization
 RECALLS = {"recall_0.25m_2deg": "0.25 m, 2°", "recall_0.5m_5deg": "0.5 m, 5°", "recall_5m_10deg": "5 m, 10°"}
 PLACEHOLDERS = {
@@ -60,12 +67,23 @@ def list_values(records: Sequence[Record], metric: str) -> np.ndarray:
 def write_page(name: str, text: str, configurations: Iterable[Mapping[str, Any]]) -> None:
     """Write a page of docs/results/ that ends with the command of this process and the files that `configurations` refer to."""
     section = format_provenance(format_command(sys.argv), configurations)
-    (RESULTS / name).write_text(f"{text.rstrip()}\n\n{section}", encoding="utf-8")
+    choose_path(RESULTS / name).write_text(f"{text.rstrip()}\n\n{section}", encoding="utf-8")
 
 
 def save_figure(figure: Figure, path: Path, configurations: Iterable[Mapping[str, Any]]) -> None:
     """Write a picture that holds the command of this process and the files that `configurations` refer to."""
-    figure.savefig(path, dpi=110, metadata={CHUNK: format_provenance(format_command(sys.argv), configurations)})
+    metadata = {CHUNK: format_provenance(format_command(sys.argv), configurations)}
+    figure.savefig(choose_path(path), dpi=110, metadata=metadata)
+
+
+def choose_path(path: Path) -> Path:
+    """Return the path of a page or picture, or one in `OTHER_RESULTS` if it belongs to another command than this process."""
+    if not path.exists() or f"\n{format_command(sys.argv)}\n".encode() in path.read_bytes():
+        return path
+    OTHER_RESULTS.mkdir(parents=True, exist_ok=True)
+    other = OTHER_RESULTS / path.name
+    print(f"Written to {other}. {path} has results of a command with other options; to replace it, move the new file there.")
+    return other
 
 
 def format_command(argv: list[str]) -> str:

@@ -4,8 +4,8 @@
 
 IDEAS lists how each idea differs from `bench train`. All train on raw descriptors of the photographs of `train/` that are in
 neither list, from random weights or from a trained network, and are scored on the 100 of `tune.txt`. Each training appends a line
-to docs/results/training-ideas.jsonl, from which docs/results/training-ideas.md is written. Without --idea, the ideas that the log
-lacks for this time and checkpoint are trained, so an interrupted run resumes.
+to docs/results/training-ideas.jsonl, from which the tool without options writes docs/results/training-ideas.md. Without --idea,
+the ideas that the log lacks for this time and checkpoint are trained, so an interrupted run resumes.
 """
 
 from __future__ import annotations

@@ -227,7 +227,9 @@ def sample_images(
     device = module.mean.device
     noise = torch.from_numpy(rng.standard_normal((count, CHANNELS, *points.grid), np.float32)).to(device)
     with autocast(module):
-        velocity = guide(module, module.build_condition(points.to(device)), guidance)
+        empty = noise.new_zeros(1, module.channels + 2 * CHANNELS, *points.grid)
+        condition = module.build_condition(points.to(device)) if guidance > 0 else empty
+        velocity = guide(module, condition, guidance)
         cells = solve(velocity, noise, [warp_time(step / steps) for step in range(steps + 1)])
     return module.to_images(cells, points.size).clamp(0, 1)
 

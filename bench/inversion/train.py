@@ -348,10 +348,11 @@ class _Trainer(Learner[AnyNetwork]):
         assert isinstance(self.module, FlowNetwork)
         assert self.drafts is not None
         drawn = [examples.draw(np.random.default_rng([self.training.seed, number])) for number in range(VARIANCE_EXAMPLES)]
-        points, photographs = build_batch(drawn, self.meta["slots"], self.meta["encoding"])
-        drafted = add_drafts(points, drawn, self.drafts, examples.public)
-        assert drafted.drafts is not None
-        self.module.measure_variance(drafted.drafts.to(self.device), photographs.to(self.device))
+        slots, encoding = self.meta["slots"], self.meta["encoding"]
+        points, photographs = build_batch(drawn, slots, encoding, drafts=self.drafts, public=examples.public)
+        assert isinstance(points, EncodedRelease)
+        assert points.drafts is not None
+        self.module.measure_variance(points.drafts.to(self.device), photographs.to(self.device))
         self.reset_average()
 
     def run(self, examples: Examples) -> AnyNetwork:
@@ -375,13 +376,12 @@ class _Trainer(Learner[AnyNetwork]):
     def _batches(self, examples: Examples) -> Iterator[tuple[Encoded, Tensor]]:
         """Yield this process's parts of the batches from the next step on. Threads build them in advance."""
         training, indices = self.training, self.group.assign_indices(self.training.batch)
+        slots, encoding, samples = self.meta["slots"], self.meta["encoding"], self.module.shape.samples
 
         def build(step: int) -> tuple[Encoded, Tensor]:
             rngs = [np.random.default_rng([training.seed, step, index]) for index in indices]
             batch = [examples.draw(rng) for rng in rngs]
-            points, photographs = build_batch(batch, self.meta["slots"], self.meta["encoding"], self.module.shape.samples)
-            if self.drafts is not None:
-                points = add_drafts(points, batch, self.drafts, examples.public)
+            points, photographs = build_batch(batch, slots, encoding, samples, self.drafts, examples.public)
             return (add_noise(points, photographs, rngs) if isinstance(self.module, FlowNetwork) else points), photographs
 
         workers = max(1, (os.cpu_count() or 1) // self.group.size) if isinstance(examples.views, LazyViews) else 1
@@ -423,23 +423,30 @@ class _Trainer(Learner[AnyNetwork]):
         self.optimizer.restore(tensors["moments"])
 
 
-def build_batch(examples: Sequence[Example], slots: int, encoding: Encoding, samples: int = 0) -> tuple[Encoded, Tensor]:
-    """Encode examples of points, or of lines with `samples` each. -> the releases, (B, 3, 256, 256) photographs in [0, 1]"""
+def build_batch(
+    examples: Sequence[Example],
+    slots: int,
+    encoding: Encoding,
+    samples: int = 0,
+    drafts: Drafts | None = None,
+    public: Public | None = None,
+) -> tuple[Encoded, Tensor]:
+    """Encode examples of points, or of lines with `samples` each. -> the releases, (B, 3, 256, 256) photographs in [0, 1]
+
+    `drafts` makes a draft of each photograph, by the dictionaries of `public` (default: loads them).
+    """
     releases, settings = [example.release for example in examples], [example.settings for example in examples]
     points: Encoded
     if samples:
         points = encode_lines(releases, settings, slots, encoding, samples, [example.keypoints for example in examples])
     else:
         points = encode(releases, settings, slots, encoding)
+    if drafts is not None:
+        assert isinstance(points, EncodedRelease)  # only the model "flow" reads drafts, and it reads points
+        images = np.stack([drafts(example.defense, example.release, public or Public()) for example in examples])
+        points = dataclasses.replace(points, drafts=torch.from_numpy(images).permute(0, 3, 1, 2))
     pixels = torch.from_numpy(np.stack([example.pixels for example in examples]))
     return points, pixels.permute(0, 3, 1, 2).float() / 255
-
-
-def add_drafts(points: Encoded, examples: Sequence[Example], drafts: Drafts, public: Public) -> EncodedRelease:
-    """Add the drafts of the examples to their encoded releases."""
-    assert isinstance(points, EncodedRelease)  # only the model "flow" reads drafts, and it reads points
-    images = np.stack([drafts(example.defense, example.release, public) for example in examples])
-    return dataclasses.replace(points, drafts=torch.from_numpy(images).permute(0, 3, 1, 2))
 
 
 def validate(
@@ -459,9 +466,7 @@ def validate(
     scores, errors, losses = [], [], []
     for view in views:
         example = examples.release_view(view, rng)
-        points, truth = build_batch([example], slots, encoding, module.shape.samples)
-        if drafts is not None:
-            points = add_drafts(points, [example], drafts, examples.public)
+        points, truth = build_batch([example], slots, encoding, module.shape.samples, drafts, examples.public)
         if isinstance(module, FlowNetwork) and isinstance(points, EncodedRelease):
             images = sample_images(module, points, 1, VALIDATION_STEPS, 1.0, rng)
             losses.append(measure_loss(module, add_noise(points, truth, [rng])))

@@ -300,6 +300,37 @@ def find_network(
     return None, f" ({'; '.join(reasons)})" if reasons else ""
 
 
+@dataclass(frozen=True)
+class AdaptedNetworks:
+    """The networks of an attack, of which it uses the one that was trained for the releases."""
+
+    attack: str
+    asset: str  # its field `weights`
+    shipped: Mapping[str, str]
+    model: str | None = None
+    options: str = ""  # of `bench train` for such a network
+
+    def explain_missing(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
+        """Return the reason why there is no network for these releases, and the next step; None if there is one."""
+        path, details = find_network(self.asset, self.shipped, defense, extractor, public, self.model)
+        command = f"bench train --defense {defense.name()}{self.options}"
+        advice = f"train one with `{command}` and pass {self.attack}:weights=FILE"
+        return None if path else f"no adapted attacker{details}; {advice}"
+
+    def load(self, defense: Defense, extractor: Extractor, public: Public) -> Network:
+        """Load the network for these releases.
+
+        Raises
+        ------
+        UserError
+            if there is none.
+        """
+        path, _ = find_network(self.asset, self.shipped, defense, extractor, public, self.model)
+        if path is None:
+            raise UserError(f"{self.attack}: {self.explain_missing(defense, extractor, public)}")
+        return load(path)
+
+
 def _explain_other_releases(target: dict[str, Any], defense: Defense, public: Public) -> str | None:
     """Return the reason why the releases of one target are not those of `defense`."""
     trained_for, supported = target["defense"], _decode_settings(target)

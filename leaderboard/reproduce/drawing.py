@@ -15,7 +15,7 @@ from bench.core.errors import SampleError
 from bench.images import samples
 from bench.runner.directory import reconstruction_path
 from bench.types import Bytes
-from leaderboard.figures import Panel
+from leaderboard.figures import Panel, lay_out
 from leaderboard.provenance import CHUNK
 from leaderboard.reproduce.profiles import Setting
 from leaderboard.reproduce.run import EvaluationSet, RunResult, select_records
@@ -71,6 +71,7 @@ class Drawing:
 def save(figure: Figure, path: Path, provenance: str) -> list[Path]:
     """Write the figure in all formats and return their paths. The PNG holds `provenance` as a text chunk."""
     path.parent.mkdir(parents=True, exist_ok=True)
+    lay_out(figure)
     files = [path.with_name(f"{path.name}.{suffix}") for suffix in FORMATS]
     for file, metadata in zip(files, FORMATS.values(), strict=True):
         figure.savefig(file, metadata=metadata | ({CHUNK: provenance} if file.suffix == ".png" else {}))

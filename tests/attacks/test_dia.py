@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from attacks import dia
 from attacks.dia import DIA
 from bench.api import View
 from bench.codebook.public import ASSETS, Public
@@ -115,7 +114,7 @@ def test_a_candidate_of_posterior_zero_has_no_effect(pixels, network):
 def test_another_context_model_is_refused_before_anything_is_written(network, monkeypatch, meta):
     named = {key: value for key, value in network.meta.items() if key != "context"}
     changed = dataclasses.replace(network, meta=named | meta)
-    monkeypatch.setattr(dia, "load", lambda path: changed)
+    monkeypatch.setattr(weights, "load", lambda path: changed)
     with pytest.raises(UserError, match="another context model"):
         DIA().assets(LDP(), Sift(), Public())
 

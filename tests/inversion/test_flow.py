@@ -14,6 +14,7 @@ from torch import Tensor
 import bench
 from attacks.dia import DIA
 from attacks.generative import UNUSED, Generative
+from bench.api import View
 from bench.cli import main
 from bench.codebook.examples import draw_features, write_dictionary
 from bench.codebook.public import Public
@@ -31,6 +32,7 @@ from bench.inversion.plan import Plan, Training
 from bench.inversion.train import find_drafts, train
 from bench.settings import Asset, Between, OneOf
 from bench.testing import check_attack
+from bench.threat_model import PublicAssets
 from bench.types import Descriptors, Features, Points
 from defenses.affine import Affine
 from defenses.ldp import LDP
@@ -442,11 +444,24 @@ def test_bench_trains_and_runs_the_attack(tmp_path: Path, capsys: pytest.Capture
     assert bench.load_records(tmp_path / "r")["metrics.ssim"].nunique() == 3
 
 
-def test_without_a_network_it_does_not_apply(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(weights, "ASSETS", tmp_path)
-    reason = Generative().explain_not_applicable(Undefended(), Sift(), Public())
-    assert "train one with `bench train --model flow`" in str(reason)
+def test_it_does_not_apply_to_hidden_positions() -> None:
     assert "reads Points" in str(Generative().explain_not_applicable(RandomLines(), Sift(), Public()))
+
+
+def test_a_prior_computes_no_draft(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The shipped network reads drafts, and as a prior it reads nothing of the release. The control needs a draft."""
+
+    def fail(*_: object) -> None:
+        raise AssertionError("computed")
+
+    public, defense = Public(), Undefended()
+    release = defense.protect(draw_features(20), public, np.random.default_rng(0))
+    view = View(release=release, defense=defense, extractor=Sift(), knowledge={PublicAssets: lambda: PublicAssets(assets=public)})
+    monkeypatch.setattr(Drafter, "__call__", fail)
+    with pytest.raises(AssertionError, match="computed"):
+        Generative(steps=1).sample(view, np.random.default_rng(0))
+    monkeypatch.setattr(FlowNetwork, "build_condition", fail)
+    assert Generative(steps=1, guidance=0.0).sample(view, np.random.default_rng(0)).shape == (1, *release.size, 3)
 
 
 @pytest.mark.parametrize("fields", [{"samples": 0}, {"steps": 0}, {"guidance": -1.0}, {"guidance": math.nan}])

@@ -1,6 +1,7 @@
 """The inversion network: encoding, loss, exact resumption of training, weights, and the rule about dictionaries."""
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
@@ -8,9 +9,12 @@ import torch
 from fakes import interrupted_training
 from skimage.metrics import structural_similarity
 
+from attacks.dia import DIA
+from attacks.dia_lines import DIALines
+from attacks.generative import Generative
 from bench.cli import main
 from bench.codebook import build, dictionary
-from bench.codebook.public import Public
+from bench.codebook.public import ASSETS, Public
 from bench.core.errors import UserError
 from bench.extractors.sift import Sift
 from bench.geometry.nearest_words import WordIndex
@@ -29,6 +33,7 @@ from bench.settings import Asset, Between, OneOf
 from bench.types import Descriptors, Points, Subspaces, WordSets
 from defenses.affine import Affine, reparameterise
 from defenses.ldp import LDP
+from defenses.lines import RandomLines
 from defenses.naive_ldp import NaiveLDP
 from defenses.none import Undefended
 from defenses.plateau import Plateau
@@ -645,3 +650,23 @@ def test_bench_train_trains_resumes_and_continues(album, tmp_path, sources, caps
         main(["run", "--defense", "none", "--attack", f"dia:weights={out}", "--images", str(held), "--out", str(tmp_path / "r")])
         == 0
     )
+
+
+@pytest.mark.parametrize(
+    ("attack", "defense", "command"),
+    [
+        (DIA(), LDP(), "bench train --defense ldp"),
+        (DIA(weights=Asset("shipped-as-printed")), LDP(), "bench train --defense ldp --encoding released"),
+        (DIALines(), RandomLines(), "bench train --defense lines"),
+        (Generative(), Undefended(), "bench train --defense none --model flow"),
+    ],
+)
+def test_without_a_network_an_attack_does_not_apply(attack, defense, command, monkeypatch, tmp_path):
+    """It says how to train one, and refuses to run. Control: with a file of another network, the reason names the file."""
+    monkeypatch.setattr(weights, "ASSETS", tmp_path)
+    reason = f"no adapted attacker; train one with `{command}` and pass {attack.name()}:weights=FILE"
+    assert attack.explain_not_applicable(defense, Sift(), Public()) == reason
+    with pytest.raises(UserError, match=re.escape(f"{attack.name()}: {reason}")):
+        attack.assets(defense, Sift(), Public())
+    other = dataclasses.replace(attack, weights=Asset(str(ASSETS / "inversion-affine.safetensors")))
+    assert "no adapted attacker (inversion-affine.safetensors " in str(other.explain_not_applicable(defense, Sift(), Public()))

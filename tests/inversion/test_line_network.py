@@ -231,8 +231,5 @@ def test_bench_trains_and_runs_the_attack(tmp_path: Path, capsys: pytest.Capture
     assert "position-error" in capsys.readouterr().out
 
 
-def test_without_a_network_it_does_not_apply(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(weights, "ASSETS", tmp_path)
-    reason = DIALines().explain_not_applicable(RandomLines(), Sift(), Public())
-    assert "train one with `bench train --defense lines`" in str(reason)
+def test_it_does_not_apply_to_points() -> None:
     assert "reads Lines" in str(DIALines().explain_not_applicable(Undefended(), Sift(), Public()))

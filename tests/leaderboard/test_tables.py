@@ -8,6 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from PIL import Image
 from record_lines import record
 from rich.console import Console
 from scipy import stats
@@ -17,6 +20,7 @@ from bench.core.table import Table, to_csv, to_markdown, to_terminal
 from leaderboard import figures, tables
 from leaderboard.chance import RECIPROCAL_RANK
 from leaderboard.identification import measure_bits
+from leaderboard.reproduce import drawing
 
 SIFT = {"name": "sift", "upright": True}
 
@@ -226,8 +230,6 @@ def test_pipe_in_a_reason_does_not_break_markdown() -> None:
 
 @pytest.mark.slow
 def test_figure_has_a_panel_for_each_record(tmp_path: Path) -> None:
-    from PIL import Image
-
     image = tmp_path / "image.png"
     Image.fromarray(np.zeros((256, 256, 3), np.uint8)).save(image)
     failed = record(status="failed", reason="too $dark$ " * 20, run_hash="f", metrics={})
@@ -242,3 +244,24 @@ def test_figure_has_a_panel_for_each_record(tmp_path: Path) -> None:
         assert picture.width == figures.PIXELS * min(len(panels), figures.COLUMNS)
         black = (np.asarray(picture).max(axis=2) == 0).sum()  # mostly those of the two images
         assert black > 2 * (figures.PIXELS - 2 * figures.MARGIN) ** 2 * (len(panels) // 3)
+
+
+def test_a_figure_is_laid_out_once_for_all_formats(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The picture is the same, bit for bit. Control: without the layout it is another."""
+    layouts = []
+    execute = ConstrainedLayoutEngine.execute
+    monkeypatch.setattr(ConstrainedLayoutEngine, "execute", lambda *given: layouts.append(execute(*given)))
+
+    def draw() -> Figure:
+        return figures.draw([figures.Panel(np.zeros((30, 40, 3), np.uint8), "title\nof two lines", "caption")] * 2, "heading")
+
+    plain, unplaced = draw(), draw()
+    plain.savefig(tmp_path / "plain.png")
+    unplaced.set_layout_engine(None)
+    unplaced.savefig(tmp_path / "unplaced.png")
+    layouts.clear()
+    png, _ = drawing.save(draw(), tmp_path / "once", "")
+    assert len(layouts) == 1
+    once, expected, other = (np.asarray(Image.open(path)) for path in (png, tmp_path / "plain.png", tmp_path / "unplaced.png"))
+    assert np.array_equal(once, expected)
+    assert not np.array_equal(once, other)

@@ -9,6 +9,8 @@ import pytest
 import result_page
 import tune_attacks
 from fakes import write_album
+from matplotlib.figure import Figure
+from PIL import Image
 
 from bench.cache import store
 from bench.images.photographs import list_photographs
@@ -62,3 +64,30 @@ def test_a_page_ends_with_its_provenance(tmp_path: Path, monkeypatch: pytest.Mon
     assert text.startswith("# Title\n\n## Provenance\n")
     assert "```\npython tools/tune_attacks.py --data DATA\n```" in text
     assert list_stale(text) == []
+
+
+def test_a_command_with_other_options_keeps_the_page(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """And the picture. The command of the page replaces both, also from another folder (control)."""
+    monkeypatch.setattr(result_page, "RESULTS", tmp_path)
+    monkeypatch.setattr(result_page, "OTHER_RESULTS", tmp_path / "other")
+    page, picture = tmp_path / "page.md", tmp_path / "picture.png"
+
+    def run(text: str, *options: str) -> str:
+        monkeypatch.setattr("sys.argv", ["tools/measure_curves.py", *options])
+        result_page.write_page("page.md", text, [])
+        figure = Figure(figsize=(len(text), 1))
+        result_page.save_figure(figure, picture, [])
+        return capsys.readouterr().out
+
+    def read(folder: Path) -> tuple[str, int]:
+        return (folder / page.name).read_text(encoding="utf-8").splitlines()[0], Image.open(folder / picture.name).width // 110
+
+    assert run("12", "--data", "one", "--samples", "4") == ""
+    assert read(tmp_path) == ("12", 2)
+    for options in ((), ("--samples", "44"), ("--samples", "4", "--photographs", "2")):
+        assert str(tmp_path / "other" / "picture.png") in run("123", "--data", "one", *options)
+        assert (read(tmp_path), read(tmp_path / "other")) == (("12", 2), ("123", 3))
+    assert run("1234", "--data", "two", "--samples", "4") == ""
+    assert read(tmp_path) == ("1234", 4)
