@@ -75,6 +75,7 @@ class _Judgement:
 
     group: ComparisonGroup
     results: Sequence[SuiteResult]  # with worst cases
+    latest: Sequence[SuiteResult]  # the last one of each defense
     flags: Mapping[SuiteResult, Sequence[Flag]]
     noise: Mapping[WorstCase, NoiseComparison]
 
@@ -84,8 +85,9 @@ def build_group_tables(
 ) -> dict[str, Table]:
     """Return the table `defenses` with a row for each defense, and `worst-case` with one for each measure. {} without results.
 
-    `groups` may hold the utilities of the defenses. `brief` tables show a defense under the latest suite that it has all results
-    of, and not also under earlier ones; the one of worst cases has the measures that rank defenses alone.
+    `groups` may hold the utilities of the defenses. The value `latest` of a row is true under the latest suite that the defense
+    has all results of, and in an incomplete row. `brief` tables have these rows alone. In them, the table of worst cases has the
+    measures that rank defenses alone.
     """
     return _build_tables(group, list_results(group), groups, brief)
 
@@ -108,7 +110,7 @@ def _build_tables(
     if not judgement.results:
         return {}
     if brief:  # flags compare the results of all defenses under a suite, shown or not
-        judgement = dataclasses.replace(judgement, results=_select_latest(judgement.results))
+        judgement = dataclasses.replace(judgement, results=judgement.latest)
     return {"defenses": _build_defenses(judgement, groups), "worst-case": _build_worst_cases(judgement, brief)}
 
 
@@ -126,6 +128,7 @@ def _judge(group: ComparisonGroup, every: Sequence[SuiteResult], groups: Sequenc
     return _Judgement(
         group=group,
         results=results,
+        latest=_select_latest(results),
         flags={result: [one for one in flags[result.suite] if one.experiment in result.applicable] for result in results},
         noise=compare_with_noise(group, groups, results),
     )
@@ -171,6 +174,7 @@ def _build_defense_row(judgement: _Judgement, result: SuiteResult, utility: Util
     values = {
         "defense": result.defense,
         "suite": _name_suite(result),
+        "latest": result in judgement.latest,
         **{
             name: value
             for measure in DEFENSE_MEASURES
@@ -289,6 +293,7 @@ def _build_row(judgement: _Judgement, result: SuiteResult, worst: WorstCase) -> 
     values = {
         "defense": result.defense,
         "suite": _name_suite(result),
+        "latest": result in judgement.latest,
         "measure": measure.name,
         "worst_case": worst.score,
         "attack": worst.experiment.attack,

@@ -220,7 +220,7 @@ def test_a_row_opens_its_experiment_by_keyboard(page: Any) -> None:
     shows(page, "ldp against dia")
     page.keyboard.press("Escape")
     closed(page)
-    page.wait_for_function("document.activeElement.className === 'open'")  # the focus is back on the link
+    playwright.expect(page.locator("a.open:focus")).to_have_count(1)  # the focus is back on the link
 
 
 @pytest.mark.exhaustive
@@ -247,8 +247,7 @@ def test_the_slider_uncovers_the_photograph(page: Any) -> None:
     page.locator("tr:visible .open").first.click()
     stage, slider = dialog(page).locator(".stage"), dialog(page).locator(".stage input")
     for name in ("original", "reconstruction"):
-        loaded = f"document.querySelector('dialog[open] .{name}').naturalWidth"
-        page.wait_for_function(f"{loaded} === 256")
+        playwright.expect(dialog(page).locator(f".{name}")).to_have_js_property("naturalWidth", 256)
 
     def covered() -> str:
         return str(page.evaluate("getComputedStyle(document.querySelector('dialog[open] .reconstruction')).clipPath"))
@@ -297,9 +296,8 @@ def test_the_pictures_above_the_table_are_of_one_sample_in_the_order_of_the_rank
     ]
     assert captions[5].endswith("by dia SSIM 0.95")
     assert captions[6:] == ["new by nearest SSIM 0.01"]
-    page.wait_for_function(
-        "[...document.querySelectorAll('.group:not([hidden]) li img')].every((one) => one.naturalWidth === 256)"
-    )
+    for picture in page.locator(".group:visible li img").all():
+        playwright.expect(picture).to_have_js_property("naturalWidth", 256)
     sources = [picture.locator("img").get_attribute("src") for picture in pictures.all()]
     assert len(set(sources)) == 7
     assert position(page.locator(".overview:visible"))["y"] < position(page.locator(".frame table:visible"))["y"]
@@ -321,7 +319,7 @@ def test_the_pictures_above_the_table_open_their_experiments_by_keyboard(page: A
         shows(page, title)
         page.keyboard.press("Escape")
         closed(page)
-        page.wait_for_function("document.activeElement.closest('.overview') !== null")  # the focus is back
+        playwright.expect(page.locator(".overview a:focus")).to_have_count(1)  # the focus is back
     link = page.get_by_role("link", name="Reconstruction of 0.png affine dim=4 by nearest SSIM 0.6")
     playwright.expect(link).to_be_focused()
 
@@ -336,7 +334,8 @@ def test_nothing_moves_when_pictures_load(browser: Any, index: Path) -> None:
         if name.startswith("absent"):
             page.route("**/*.webp", lambda route: route.abort())
         page.goto(index.as_uri())
-        page.wait_for_function("[...document.images].filter((one) => one.checkVisibility()).every((one) => one.complete)")
+        for picture in page.locator("img:visible").all():
+            playwright.expect(picture).to_have_js_property("complete", True)
         if name.endswith("without sizes"):
             page.evaluate(
                 """(style) => {

@@ -1,5 +1,6 @@
 """Worst cases over a suite of attacks: the claim of a version, the worst case, and the flags of attacks that failed."""
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -289,6 +290,7 @@ def test_a_run_of_the_newest_version_has_the_older_one_too(tmp_path: Path, monke
     shown, terminal = (build_group_tables(group, brief=brief)["worst-case"] for brief in (False, True))
     assert {row.values["suite"] for row in shown.rows} == {STANDARD, NEWEST}
     assert {row.values["suite"] for row in terminal.rows} == {NEWEST}
+    assert {row.values["suite"]: row.values["latest"] for row in shown.rows} == {STANDARD: False, NEWEST: True}
     (older,) = list_results(build_group(tmp_path / "old", run_suite()))
     assert older.version == STANDARD
 
@@ -323,3 +325,28 @@ def test_the_page_shows_the_worst_cases(tmp_path: Path) -> None:
     for kind in ("defenses", "worst-case"):
         (table,) = (tmp_path / "site" / "tables").glob(f"*-{kind}.csv")
         assert STANDARD in table.read_text(encoding="utf-8")
+
+
+@pytest.mark.slow
+def test_the_page_shows_rows_of_older_versions_in_a_collapsed_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(attack_suite, "list_attack_suites", lambda: [STANDARD, NEWEST])
+
+    def list_rows(name: str, records: Sequence[dict[str, Any]]) -> list[tuple[str, int, int]]:
+        """Return the table, and the rows of the older and of the newest version in it, for each table of worst cases."""
+        fabricated.write(tmp_path / name / "results", records)
+        written = site.write([tmp_path / name / "results"], tmp_path / name / "site")
+        parts = re.findall(
+            r'role="region" aria-label="(Worst case.*?)">(.*?)</table>', written.page.read_text("utf-8"), re.DOTALL
+        )
+        return [(label, *(part.count(f"<td>{suite}</td>") for suite in (STANDARD, NEWEST))) for label, part in parts]
+
+    title, older = "Reconstruction on photos", ", older versions of the suite"
+    defenses, measures = f"Worst case of each defense, {title}", f"Worst cases of {title}"
+    both = [*run_suite(suite=NEWEST), *run_suite(epsilon=12.0)]
+    assert list_rows("both", both) == [(defenses, 1, 1), (defenses + older, 1, 0), (measures, 2, 2), (measures + older, 2, 0)]
+    page = (tmp_path / "both" / "site" / "index.html").read_text(encoding="utf-8")
+    assert page.index("<summary>Older versions of the suite") < page.index(older)
+    assert "<details open" not in page
+    (table,) = (tmp_path / "both" / "site" / "tables").glob("*-defenses.csv")  # files hold the rows of all versions
+    assert [table.read_text(encoding="utf-8").count(suite) for suite in (STANDARD, NEWEST)] == [2, 1]
+    assert list_rows("old", run_suite()) == [(defenses, 1, 0), (measures, 2, 0)]  # the control: one version alone
