@@ -226,6 +226,32 @@ def test_ssim_of_the_loss_is_scikit_images(rng):
     assert ours != pytest.approx(other, abs=1e-4)  # negative control: the comparison distinguishes settings
 
 
+@pytest.mark.parametrize("size", [(64, 64), (11, 130), (256, 61)])
+def test_gradient_of_the_loss_is_that_of_convolutions(size, rng):
+    image, photograph = (torch.from_numpy(rng.random((2, 3, *size)).astype(np.float32)) for _ in range(2))
+
+    def convolve(images, sigma=1.5):
+        taps = torch.exp(-(torch.arange(-5, 6) ** 2) / (2 * sigma**2))
+        taps = (taps / taps.sum())[None, None]
+        return torch.nn.functional.conv2d(torch.nn.functional.conv2d(images[:, None], taps[..., None, :]), taps[..., None])[:, 0]
+
+    def reference(image, sigma=1.5):
+        a, b = ((0.299 * x[:, 0] + 0.587 * x[:, 1] + 0.114 * x[:, 2]) for x in (image, photograph))
+        mean_a, mean_b, aa, bb, ab = (convolve(x, sigma) for x in (a, b, a * a, b * b, a * b))
+        numerator = (2 * mean_a * mean_b + 0.01**2) * (2 * (ab - mean_a * mean_b) + 0.03**2)
+        denominator = (mean_a**2 + mean_b**2 + 0.01**2) * (aa - mean_a**2 + bb - mean_b**2 + 0.03**2)
+        return torch.nn.functional.l1_loss(image, photograph) + 0.3 * (1 - (numerator / denominator).mean())
+
+    def differentiate(loss):
+        leaf = image.clone().requires_grad_()
+        loss(leaf).backward()
+        return leaf.grad
+
+    gradient = differentiate(lambda image: reconstruction_loss(image, photograph))
+    torch.testing.assert_close(gradient, differentiate(reference), rtol=1e-3, atol=1e-8)
+    assert not torch.allclose(gradient, differentiate(lambda image: reference(image, 1.6)), rtol=1e-3, atol=1e-8)  # control
+
+
 def test_loss_of_the_truth_is_zero(rng):
     image = torch.from_numpy(rng.random((1, 3, 64, 64)).astype(np.float32))
     assert float(reconstruction_loss(image, image)) == pytest.approx(0, abs=1e-6)
