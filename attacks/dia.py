@@ -60,8 +60,7 @@ class DIA(ImageAttack):
         return reconstruct_release(network, view.release, view.defense, find_symmetries(view.extractor), public)
 
     def _networks(self) -> AdaptedNetworks:
-        options = " --encoding released" if self.weights == "shipped-as-printed" else ""
-        return AdaptedNetworks(self.name(), self.weights, SHIPPED, options=options)
+        return AdaptedNetworks(self.name(), self.weights, SHIPPED)
 
 
 PLUGIN = DIA

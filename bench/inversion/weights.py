@@ -31,9 +31,8 @@ if TYPE_CHECKING:
     from bench.inversion.network import GridNetwork, Shape
 
 KIND = "inversion-network"
-# File names of the shipped networks that reconstruct the photograph from points. As printed: the input is the words of a set, or
-# origin and basis of a subspace, stacked.
-SHIPPED = {"shipped": "inversion-*.safetensors", "shipped-as-printed": "as-printed-*.safetensors"}
+# File names of the shipped networks that reconstruct the photograph from points.
+SHIPPED = {"shipped": "inversion-*.safetensors"}
 REQUIRED_METADATA = ("defense", "encoding", "extractor", "serves", "shape", "slots")  # metadata for inference
 MODELS = {None: "reconstructs the photograph", "flow": "samples photographs"}  # metadata `model` -> what the network does
 STAGE_METADATA = ("start", "crops", "batch", "photographs", "rate", "symmetries")  # metadata of each training stage

@@ -127,9 +127,9 @@ class Materials:
     raw_network: Asset = Asset("shipped")
     affine_network: Asset = Asset("shipped")
     ldp_network: Asset = Asset("shipped")
-    # Networks with the paper's input: stacked origin and basis, or stacked words (`bench train --encoding released`).
-    as_printed_affine: Asset = Asset("shipped-as-printed")
-    as_printed_ldp: Asset = Asset("shipped-as-printed")
+    # Networks with the paper's input, of `bench train --encoding released`: stacked origin and basis, or stacked words.
+    as_printed_affine: Asset | None = None
+    as_printed_ldp: Asset | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

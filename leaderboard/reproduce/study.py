@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
@@ -17,7 +17,7 @@ from bench.task_api import Task
 from bench.tasks.reconstruction import Reconstruction
 from leaderboard.chance import IDENTIFIED, label_bits, label_identified, label_rank_1
 from leaderboard.reproduce.claims import Claim, TableEntry
-from leaderboard.reproduce.profiles import Materials, Profile, Setting
+from leaderboard.reproduce.profiles import Profile, Setting
 from leaderboard.signal import BASELINES
 
 if TYPE_CHECKING:
@@ -29,9 +29,9 @@ P = TypeVar("P", bound=Plugin)
 
 AS_PRINTED = "dia, as printed"
 AS_PRINTED_NOTE = (
-    f"The rows `{AS_PRINTED}` are not in the paper. Their network reads origin and basis, or the words in their released order, "
-    "stacked as the paper prints. No context model weighs the words. Architecture, training samples and the mean over symmetries "
-    "are those of `dia`."
+    f"Rows `{AS_PRINTED}` are not in the paper. They are there if `--as-printed-affine` or `--as-printed-ldp` passes a network. It "
+    "reads origin and basis, or the words in their released order, stacked as the paper prints, and no context model weighs the "
+    "words. To compare inputs, train a network for `--affine-network` or `--ldp-network` equally."
 )
 
 
@@ -100,8 +100,10 @@ def build_reconstruction(setting: Setting) -> Reconstruction:
     return Reconstruction() if network == Asset("shipped") else Reconstruction(inverter=f"dia:weights={network}")
 
 
-def build_row_as_printed(row: Row, network: Asset) -> Row:
-    """Return the row of the same release, attacked by a network that reads it as the paper prints, without the paper's values.
+def build_rows_as_printed(rows: Iterable[Row], network: Asset | None) -> list[Row]:
+    """Return rows of the same releases, attacked by a network that reads them as the paper prints, without the paper's values.
+
+    Without a network there are none.
 
     Raises
     ------
@@ -110,15 +112,15 @@ def build_row_as_printed(row: Row, network: Asset) -> Row:
     """
     from bench.inversion import weights
 
-    if network != Materials.as_printed_ldp and (encoding := weights.load(Path(network)).meta["encoding"]) != "released":
+    if network is None:
+        return []
+    if (encoding := weights.load(Path(network)).meta["encoding"]) != "released":
         raise UserError(f"{network}: its input is {encoding}; pass a network of `bench train --encoding released`")
-    return replace(
-        row,
-        name=f"{row.name}, as printed",
-        labels={**row.labels, "attack": AS_PRINTED},
-        paper={},
-        attack=build_plugin(discovery.ATTACK, "dia", {"weights": network}),
-    )
+    attack = build_plugin(discovery.ATTACK, "dia", {"weights": network})
+    labels = {"attack": AS_PRINTED}
+    return [
+        replace(row, name=f"{row.name}, as printed", labels={**row.labels, **labels}, paper={}, attack=attack) for row in rows
+    ]
 
 
 def build_oracle_row(row: Row) -> Row:

@@ -682,7 +682,6 @@ def test_bench_train_trains_resumes_and_continues(album, tmp_path, sources, caps
     ("attack", "defense", "command"),
     [
         (DIA(), LDP(), "bench train --defense ldp"),
-        (DIA(weights=Asset("shipped-as-printed")), LDP(), "bench train --defense ldp --encoding released"),
         (DIALines(), RandomLines(), "bench train --defense lines"),
         (Generative(), Undefended(), "bench train --defense none --model flow"),
     ],

@@ -19,7 +19,7 @@ from leaderboard.reproduce.study import (
     build_identification_measures,
     build_plugin,
     build_reconstruction,
-    build_row_as_printed,
+    build_rows_as_printed,
 )
 
 PRINTED = ("mae", "ssim", "psnr")
@@ -54,7 +54,7 @@ def build_rows(setting: Setting) -> tuple[Row, ...]:
         for line in lines[:-1]
     ]
     direct = [row for row in lifted if row.labels["attack"] == "dia"]
-    return (undefended, *lifted, *(build_row_as_printed(row, materials.as_printed_affine) for row in direct))
+    return (undefended, *lifted, *build_rows_as_printed(direct, materials.as_printed_affine))
 
 
 def build_reference_rows(setting: Setting) -> tuple[Row, ...]:

@@ -21,7 +21,7 @@ from leaderboard.reproduce.study import (
     build_oracle_row,
     build_plugin,
     build_reconstruction,
-    build_row_as_printed,
+    build_rows_as_printed,
 )
 from leaderboard.reproduce.tables import table1
 
@@ -55,8 +55,8 @@ def build_rows(setting: Setting) -> tuple[Row, ...]:
                 task=task,
             )
         )
-    as_printed = materials.as_printed_ldp
-    return tuple(each for row in rows for each in (row, build_oracle_row(row), build_row_as_printed(row, as_printed)))
+    pairs = [each for row in rows for each in (row, build_oracle_row(row))]
+    return (*pairs, *build_rows_as_printed(rows, materials.as_printed_ldp))
 
 
 def _check_size(setting: Setting) -> None:
