@@ -29,9 +29,9 @@ P = TypeVar("P", bound=Plugin)
 
 AS_PRINTED = "dia, as printed"
 AS_PRINTED_NOTE = (
-    f"Rows `{AS_PRINTED}` are not in the paper. They are there if `--as-printed-affine` or `--as-printed-ldp` passes a network. It "
-    "reads origin and basis, or the words in their released order, stacked as the paper prints, and no context model weighs the "
-    "words. To compare inputs, train a network for `--affine-network` or `--ldp-network` equally."
+    f"Rows `{AS_PRINTED}` are not in the paper. They are there if `--as-printed-affine` or `--as-printed-ldp` passes a network. "
+    "It reads origin and basis, or the words in their released order, stacked as the paper prints, and no context model weighs "
+    "the words. To compare inputs, train a network for `--affine-network` or `--ldp-network` equally."
 )
 
 
