@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
@@ -28,11 +28,6 @@ if TYPE_CHECKING:
 P = TypeVar("P", bound=Plugin)
 
 AS_PRINTED = "dia, as printed"
-AS_PRINTED_NOTE = (
-    f"Rows `{AS_PRINTED}` are not in the paper. They are there if `--as-printed-affine` or `--as-printed-ldp` passes a network. "
-    "It reads origin and basis, or the words in their released order, stacked as the paper prints, and no context model weighs "
-    "the words. To compare inputs, train a network for `--affine-network` or `--ldp-network` equally."
-)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,10 +95,8 @@ def build_reconstruction(setting: Setting) -> Reconstruction:
     return Reconstruction() if network == Asset("shipped") else Reconstruction(inverter=f"dia:weights={network}")
 
 
-def build_rows_as_printed(rows: Iterable[Row], network: Asset | None) -> list[Row]:
-    """Return rows of the same releases, attacked by a network that reads them as the paper prints, without the paper's values.
-
-    Without a network there are none.
+def build_rows_as_printed(row: Row, network: Asset | None) -> list[Row]:
+    """Return a row of the same release, attacked by a network that reads it as the paper prints; none without a network.
 
     Raises
     ------
@@ -117,10 +110,8 @@ def build_rows_as_printed(rows: Iterable[Row], network: Asset | None) -> list[Ro
     if (encoding := weights.load(Path(network)).meta["encoding"]) != "released":
         raise UserError(f"{network}: its input is {encoding}; pass a network of `bench train --encoding released`")
     attack = build_plugin(discovery.ATTACK, "dia", {"weights": network})
-    labels = {"attack": AS_PRINTED}
-    return [
-        replace(row, name=f"{row.name}, as printed", labels={**row.labels, **labels}, paper={}, attack=attack) for row in rows
-    ]
+    name = f"{row.name}, as printed"
+    return [replace(row, name=name, labels={**row.labels, "attack": AS_PRINTED}, paper={}, attack=attack)]
 
 
 def build_oracle_row(row: Row) -> Row:

@@ -11,7 +11,6 @@ from leaderboard.reproduce import published
 from leaderboard.reproduce.claims import Claim, Statement, TableEntry, at_least, falling, same_order
 from leaderboard.reproduce.profiles import Setting
 from leaderboard.reproduce.study import (
-    AS_PRINTED_NOTE,
     Measure,
     Row,
     Table,
@@ -54,7 +53,7 @@ def build_rows(setting: Setting) -> tuple[Row, ...]:
         for line in lines[:-1]
     ]
     direct = [row for row in lifted if row.labels["attack"] == "dia"]
-    return (undefended, *lifted, *build_rows_as_printed(direct, materials.as_printed_affine))
+    return (undefended, *lifted, *(each for row in direct for each in build_rows_as_printed(row, materials.as_printed_affine)))
 
 
 def build_reference_rows(setting: Setting) -> tuple[Row, ...]:
@@ -130,5 +129,4 @@ TABLE = Table(
     build_claims=build_claims,
     rank_measure="ssim",
     build_reference_rows=build_reference_rows,
-    notes=(AS_PRINTED_NOTE,),
 )
