@@ -118,7 +118,7 @@ class Generative(ImageAttack):
         return f"{name} reads drafts of another network than {path.name}; pass that one with generative:drafts=FILE"
 
     def _networks(self) -> AdaptedNetworks:
-        return AdaptedNetworks(self.name(), self.weights, SHIPPED, model="flow", options=" --model flow")
+        return AdaptedNetworks(self.name(), self.weights, SHIPPED, model="flow")
 
 
 PLUGIN = Generative

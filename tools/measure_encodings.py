@@ -31,7 +31,7 @@ from bench.settings import Asset
 from leaderboard.intervals import Interval, interval
 
 WIDTHS = "32,64,112,112"  # of the shipped networks
-STEPS, FURTHER = 400, 300
+STEPS, FURTHER = 800, 600
 SENT = ("positions", "scale", "scale-and-orientation")
 SUBSPACES = tuple(f"affine:dim={dim}" for dim in (2, 4, 8, 16))
 WORD_SETS = tuple(f"ldp:epsilon={epsilon},subset_size={size}" for epsilon, size in ((16, 2), (12, 2), (12, 4), (10, 2)))

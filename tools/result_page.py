@@ -2,7 +2,7 @@
 
 A page or picture in docs/ belongs to the command in its provenance, where placeholders stand for local folders. A run with other
 options, such as a short test, writes to work/results/ instead, and prints the path. To replace the page, move the file, or remove
-the page before the run. The first command writes a page that does not exist.
+the page before the run. Any command writes a missing page.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "docs" / "results"
-OTHER_RESULTS = ROOT / "work" / "results"  # of commands to which no page belongs
+OTHER_RESULTS = ROOT / "work" / "results"  # pages and pictures of other commands
 SMALL_GALLERY = "gallery:views=40,queries=12,rooms=2"  # a dataset for localization
 RECALLS = {"recall_0.25m_2deg": "0.25 m, 2°", "recall_0.5m_5deg": "0.5 m, 5°", "recall_5m_10deg": "5 m, 10°"}
 PLACEHOLDERS = {

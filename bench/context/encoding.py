@@ -79,9 +79,19 @@ def find_reverse_edges(neighbours: Indices, present: Floats) -> Indices:
 
 
 def find_nearest_keypoints(keypoints: Floats, neighbours: int) -> tuple[Indices, Floats]:
-    """Return the k nearest other keypoints of each, and 1 for those that exist, else 0. (N, 2) -> (N, k), (N, k) float32"""
+    """Return the k nearest other keypoints of each, and 1 for those that exist, else 0. (N, 2) -> (N, k), (N, k) float32
+
+    Ties are in any order.
+
+    Raises
+    ------
+    ValueError
+        if a keypoint is not finite.
+    """
     import cv2
 
+    if not np.isfinite(keypoints).all():
+        raise ValueError("keypoints must be finite")
     count = len(keypoints)
     available = min(neighbours, count - 1)
     nearest = np.zeros((count, neighbours), dtype=np.int64)

@@ -5,13 +5,13 @@ from __future__ import annotations
 import functools
 import hashlib
 from collections.abc import Mapping
+from importlib.metadata import version
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from bench.cache import provenance, store
-from bench.core import environment
 from bench.identification.thumbnails import Doubles
 
 KIND = "faces"  # in the cache
@@ -40,14 +40,14 @@ def compute_overlap(one: Doubles, other: Doubles) -> Doubles:
     return intersection / (one[..., 2:].prod(axis=-1) + other[..., 2:].prod(axis=-1) - intersection)
 
 
-# This cache lets all attacks on a photograph share its detections, and that on disk all commands.
+# The cache in memory serves all attacks on a photograph, the one on disk all commands.
 @functools.lru_cache(maxsize=2)
 def _detect_faces(pixels: bytes, shape: tuple[int, int, int]) -> Doubles:
     """Return the faces that are detected in a float64 image, as boxes (F, 4)."""
     key = {
         "image": [hashlib.sha256(pixels).hexdigest(), list(shape)],
         "source": provenance.hash_modules(__name__),
-        "libraries": environment.list_library_versions(),
+        "libraries": {library: version(library) for library in ("numpy", "scikit-image")},
     }
     image = np.frombuffer(pixels).reshape(shape)
     return store.fetch(KIND, key, lambda: ({"boxes": _apply_detector(image)}, {}))[0]["boxes"]

@@ -433,7 +433,7 @@ def build_batch(
 ) -> tuple[Encoded, Tensor]:
     """Encode examples of points, or of lines with `samples` each. -> the releases, (B, 3, 256, 256) photographs in [0, 1]
 
-    `drafts` makes a draft of each photograph, by the dictionaries of `public` (default: loads them).
+    `drafts` makes a draft of each photograph, by the dictionaries of `public`.
     """
     releases, settings = [example.release for example in examples], [example.settings for example in examples]
     points: Encoded
@@ -443,7 +443,8 @@ def build_batch(
         points = encode(releases, settings, slots, encoding)
     if drafts is not None:
         assert isinstance(points, EncodedRelease)  # only the model "flow" reads drafts, and it reads points
-        images = np.stack([drafts(example.defense, example.release, public or Public()) for example in examples])
+        assert public is not None
+        images = np.stack([drafts(example.defense, example.release, public) for example in examples])
         points = dataclasses.replace(points, drafts=torch.from_numpy(images).permute(0, 3, 1, 2))
     pixels = torch.from_numpy(np.stack([example.pixels for example in examples]))
     return points, pixels.permute(0, 3, 1, 2).float() / 255

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 KIND = "inversion-network"
 # File names of the shipped networks that reconstruct the photograph from points.
 SHIPPED = {"shipped": "inversion-*.safetensors"}
+DEFAULT_EXTRACTOR = "sift"  # of `bench train`
 REQUIRED_METADATA = ("defense", "encoding", "extractor", "serves", "shape", "slots")  # metadata for inference
 MODELS = {None: "reconstructs the photograph", "flow": "samples photographs"}  # metadata `model` -> what the network does
 STAGE_METADATA = ("start", "crops", "batch", "photographs", "rate", "symmetries")  # metadata of each training stage
@@ -265,9 +267,10 @@ def explain_incompatible(meta: dict[str, Any], defense: Defense, extractor: Extr
     if meta["extractor"]["name"] != extractor.name():  # a dictionary of other features follows from it
         return explain_other_features(meta, extractor, public)
     targets = [target for target in _list_targets(meta) if target["defense"]["name"] == defense.name()]
-    reasons = [_explain_other_releases(target, defense, public) for target in targets]
+    alike = [target for target in targets if _explain_other_fields(target, defense, public) is None]
+    reasons = [_explain_other_releases(target, defense, public) for target in alike or targets]
     if None not in reasons:
-        return " or ".join(reason for reason in reasons if reason)
+        return " or ".join(dict.fromkeys(reason for reason in reasons if reason))
     return explain_other_features(meta, extractor, public)
 
 
@@ -301,20 +304,26 @@ def find_network(
 
 @dataclass(frozen=True)
 class AdaptedNetworks:
-    """The networks of an attack, of which it uses the one that was trained for the releases."""
+    """The networks that an attack can load. It uses the one that was trained for the releases."""
 
     attack: str
     asset: str  # its field `weights`
     shipped: Mapping[str, str]
-    model: str | None = None
-    options: str = ""  # of `bench train` for such a network
+    model: str | None = None  # a key of `MODELS`
 
     def explain_missing(self, defense: Defense, extractor: Extractor, public: Public) -> str | None:
         """Return the reason why there is no network for these releases, and the next step; None if there is one."""
         path, details = find_network(self.asset, self.shipped, defense, extractor, public, self.model)
-        command = f"bench train --defense {defense.name()}{self.options}"
-        advice = f"train one with `{command}` and pass {self.attack}:weights=FILE"
-        return None if path else f"no adapted attacker{details}; {advice}"
+        if path is not None:
+            return None
+        features = spec.to_text(extractor)
+        options = [
+            *([] if self.model is None else ["--model", self.model]),
+            *("--defense", spec.to_text(defense)),
+            *([] if features == DEFAULT_EXTRACTOR else ["--extractor", features]),
+        ]
+        command = shlex.join(["bench", "train", *options])
+        return f"no adapted attacker{details}; train one with `{command}` and pass {self.attack}:weights=FILE"
 
     def load(self, defense: Defense, extractor: Extractor, public: Public) -> Network:
         """Load the network for these releases.
@@ -332,13 +341,20 @@ class AdaptedNetworks:
 
 def _explain_other_releases(target: dict[str, Any], defense: Defense, public: Public) -> str | None:
     """Return the reason why the releases of one target are not those of `defense`."""
+    if (reason := _explain_other_fields(target, defense, public)) is not None:
+        return reason
+    for field, setting in _decode_settings(target).items():
+        if getattr(defense, field) not in setting:
+            return f"trained for {field} {setting}, not {getattr(defense, field)}"
+    return None
+
+
+def _explain_other_fields(target: dict[str, Any], defense: Defense, public: Public) -> str | None:
+    """Return the reason why `defense` is none of one target, whatever its supported settings."""
     trained_for, supported = target["defense"], _decode_settings(target)
     if trained_for["name"] != defense.name():
         return f"trained for {trained_for['name']}"
     configuration = _configure(defense, public)
-    for field, setting in supported.items():
-        if getattr(defense, field) not in setting:
-            return f"trained for {field} {setting}, not {getattr(defense, field)}"
     defaults = {name: value for part in list_parts(defense) for name, value in fields.list_defaults(type(part)).items()}
     trained = defaults | trained_for  # a field added after the training counts as its default
     for field in sorted((configuration.keys() | trained_for.keys()) - supported.keys()):

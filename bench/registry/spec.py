@@ -113,6 +113,28 @@ def to_json(plugin: Plugin) -> dict[str, Any]:
     return {"name": plugin.name()} | {name: _encode(kind, getattr(plugin, name)) for name, kind in types.items()}
 
 
+def to_text(plugin: Plugin) -> str:
+    """Return the specification that `read` turns into that plugin: its name, and the fields that differ from their defaults.
+
+    >>> from defenses.ldp import LDP
+    >>> to_text(LDP(epsilon=20, memoize=True))
+    'ldp:epsilon=20,memoize=true'
+    """
+    if isinstance(plugin, Composed):
+        return "+".join(map(to_text, plugin.parts))
+    defaults, given = (
+        fields.list_defaults(type(plugin)),
+        {name: getattr(plugin, name) for name in fields.resolve_types(type(plugin))},
+    )
+    changed = [f"{name}={_to_text(value)}" for name, value in given.items() if name not in defaults or value != defaults[name]]
+    return ":".join([plugin.name(), *([",".join(changed)] if changed else [])])
+
+
+def _to_text(value: Any) -> str:
+    text = str(value)
+    return text.lower() if isinstance(value, bool) else text.removesuffix(".0") if isinstance(value, float) else text
+
+
 def encode_infinity(value: float | None) -> float | str | None:
     """Return infinity as text and other numbers unchanged: JSON has no infinity."""
     return str(value) if value is not None and math.isinf(value) else value

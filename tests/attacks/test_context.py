@@ -13,6 +13,7 @@ from sklearn.neighbors import NearestNeighbors
 from train_word_attackers import Stage, fit
 
 from attacks.context import Context
+from attacks.dia import DIA
 from bench.api import View
 from bench.codebook.examples import draw_features, write_dictionary
 from bench.codebook.public import ASSETS, Public
@@ -243,6 +244,11 @@ def test_nearest_keypoints(rng):
     assert not find_nearest_keypoints(keypoints[:1], 5)[1].any()
 
 
+def test_keypoints_must_be_finite():
+    with pytest.raises(ValueError, match="keypoints must be finite"):
+        find_nearest_keypoints(np.float32([[1, 1], [np.nan, 2]]), 1)
+
+
 def test_no_keypoint_is_its_own_neighbour_among_coincident_ones():
     keypoints = np.repeat(np.float32([[1, 1], [9, 9]]), 8, axis=0)
     near, _ = find_nearest_keypoints(keypoints, 3)
@@ -340,8 +346,13 @@ def test_the_estimate_is_reproducible_and_independent_of_order(public, secret):
 
 
 def test_applies_to_the_releases_it_was_trained_for(public, tmp_path):
-    assert Context().explain_not_applicable(LDP(), Sift(), public) is None
+    clustered = Asset("shipped-clustered")
+    for defense in (LDP(), LDP(dictionary=clustered, words=8000, epsilon=6.534)):
+        assert Context().explain_not_applicable(defense, Sift(), public) is None
+        assert DIA().explain_not_applicable(defense, Sift(), public) is None
     for defense, reason in (
+        (LDP(dictionary=clustered, words=4000), "words 8000, not 4000"),
+        (LDP(dictionary=clustered, words=8000, epsilon=13), "epsilon 4.6 to 12.5, not 13"),
         (LDP(epsilon=20), "epsilon"),
         (LDP(subset_size=5), "subset_size"),
         (LDP(words=1000), "words"),

@@ -252,6 +252,21 @@ def test_gradient_of_the_loss_is_that_of_convolutions(size, rng):
     assert not torch.allclose(gradient, differentiate(lambda image: reference(image, 1.6)), rtol=1e-3, atol=1e-8)  # control
 
 
+def test_the_loss_allows_any_factor_and_autocast(rng):
+    image, photograph = (torch.from_numpy(rng.random((1, 3, 64, 64)).astype(np.float32)) for _ in range(2))
+    gradients = []
+    for factor, autocast in ((1, False), (-2, False), (1, True)):
+        leaf = image.clone().requires_grad_()
+        with torch.autocast("cpu", torch.bfloat16, enabled=autocast):
+            loss = factor * reconstruction_loss(leaf, photograph)
+        loss.backward()
+        gradients.append(leaf.grad)
+    torch.testing.assert_close(gradients[1], -2 * gradients[0])
+    torch.testing.assert_close(gradients[2], gradients[0])
+    with pytest.raises(ValueError, match="at least 11 pixels a side, got 10"):
+        reconstruction_loss(image[:, :, :10], photograph[:, :, :10])
+
+
 def test_loss_of_the_truth_is_zero(rng):
     image = torch.from_numpy(rng.random((1, 3, 64, 64)).astype(np.float32))
     assert float(reconstruction_loss(image, image)) == pytest.approx(0, abs=1e-6)
@@ -682,8 +697,9 @@ def test_bench_train_trains_resumes_and_continues(album, tmp_path, sources, caps
     ("attack", "defense", "command"),
     [
         (DIA(), LDP(), "bench train --defense ldp"),
+        (DIA(), LDP(epsilon=20), "bench train --defense ldp:epsilon=20"),
         (DIALines(), RandomLines(), "bench train --defense lines"),
-        (Generative(), Undefended(), "bench train --defense none --model flow"),
+        (Generative(), Undefended(), "bench train --model flow --defense none"),
     ],
 )
 def test_without_a_network_an_attack_does_not_apply(attack, defense, command, monkeypatch, tmp_path):

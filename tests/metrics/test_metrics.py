@@ -236,15 +236,24 @@ def test_faces_are_those_of_scikit_image(portrait: np.ndarray) -> None:
 
 
 def test_faces_are_cached_by_image_and_shape(portrait: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    image = portrait[:96, :128].astype(np.float64)
+    images = {"face": portrait.astype(np.float64), "grey": np.full((96, 128, 3), 0.5)}
+    others = {"turned": images["face"].transpose(1, 0, 2).copy(), "grey": images["grey"].reshape(128, 96, 3)}
+
+    def detect(image: np.ndarray) -> list[list[float]]:
+        faces._detect_faces.cache_clear()  # as in another command
+        found: list[list[float]] = faces.detect_faces(image).tolist()
+        return found
+
     with store.use_folder(tmp_path):
-        faces._detect_faces.cache_clear()
-        first = faces.detect_faces(image)
-        faces._detect_faces.cache_clear()  # as in the next command
-        monkeypatch.setattr(faces, "_apply_detector", lambda image: np.ones((1, 4)))
-        assert np.array_equal(faces.detect_faces(image), first)
-        assert len(faces.detect_faces(image.reshape(128, 96, 3))) == len(faces.detect_faces(1 - image)) == 1  # other images
-        assert len(list((tmp_path / faces.KIND).iterdir())) == 3
+        found = {name: detect(image) for name, image in images.items()}
+        assert [len(boxes) for boxes in found.values()] == [1, 0]
+        monkeypatch.setattr(faces, "_apply_detector", lambda image: np.ones((2, 4)))
+        assert {name: detect(image) for name, image in images.items()} == found
+        assert all(detect(image) == [[1.0] * 4] * 2 for image in others.values())
+        for name, other in (("version", lambda library: "0"), ("provenance.hash_modules", lambda module: "sha256:0")):
+            with monkeypatch.context() as patch:
+                patch.setattr(f"bench.identification.faces.{name}", other)
+                assert len(detect(images["face"])) == 2  # of another library or source
     faces._detect_faces.cache_clear()
 
 

@@ -37,6 +37,23 @@ def test_infinity_booleans_choices_and_paths() -> None:
 
 
 @pytest.mark.parametrize(
+    ("kind", "text"),
+    [
+        (discovery.DEFENSE, "ldp"),
+        (discovery.DEFENSE, "ldp:epsilon=12.5,memoize=true"),
+        (discovery.DEFENSE, "ldp:epsilon=inf,dictionary=/a/b.safetensors"),
+        (discovery.DEFENSE, "lines+affine:lifting=random,dim=2"),
+        (discovery.EXTRACTOR, "sift:upright=false"),
+        (discovery.ATTACK, "clustering:coverage=0.5"),
+    ],
+)
+def test_the_text_of_a_plugin_is_read_as_that_plugin(kind: discovery.Kind, text: str) -> None:
+    plugin = spec.read(text, kind)
+    assert spec.read(spec.to_text(plugin), kind) == plugin
+    assert sorted(spec.to_text(plugin).replace("=", ",").split(",")) == sorted(text.replace("=", ",").split(","))
+
+
+@pytest.mark.parametrize(
     ("text", "complaint"),
     [
         ("lpd", "did you mean 'ldp'"),

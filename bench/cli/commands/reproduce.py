@@ -49,7 +49,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         parser.add_argument(
             f"--as-printed-{defense}",
             metavar="FILE",
-            help=f"network trained for `{defense}` with the paper's input, {stacked} (default: none, and no such rows)",
+            help=f"network trained for `{defense}` with the paper's input, {stacked} (default: none; the table omits these rows)",
         )
 
 
