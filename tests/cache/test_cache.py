@@ -162,7 +162,7 @@ def test_cached_seconds_are_those_of_the_attack(images: Path, small: Asset, monk
 def test_fast_attacks_are_not_cached(images: Path, small: Asset, cache_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(attack_cache, "MIN_SECONDS", np.inf)
     run(LDP(dictionary=small), Guess(), images)
-    assert {entry.kind for entry in store.list_entries()} == {"words"}
+    assert {entry.kind for entry in store.list_entries()} - {"faces"} == {"words"}  # faces may be in the memory of this process
 
 
 def test_cached_content_is_used(images: Path, small: Asset) -> None:
