@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import math
 import re
@@ -122,12 +123,18 @@ def to_text(plugin: Plugin) -> str:
     """
     if isinstance(plugin, Composed):
         return "+".join(map(to_text, plugin.parts))
-    defaults, given = (
-        fields.list_defaults(type(plugin)),
-        {name: getattr(plugin, name) for name in fields.resolve_types(type(plugin))},
-    )
-    changed = [f"{name}={_to_text(value)}" for name, value in given.items() if name not in defaults or value != defaults[name]]
-    return ":".join([plugin.name(), *([",".join(changed)] if changed else [])])
+    changed = [name for name in fields.resolve_types(type(plugin)) if not _is_default(plugin, name)]
+    given = ",".join(f"{name}={_to_text(getattr(plugin, name))}" for name in changed)
+    return f"{plugin.name()}:{given}" if given else plugin.name()
+
+
+def _is_default(plugin: Plugin, name: str) -> bool:
+    """Return whether the plugin with the default of that field is the same. Plugins replace `installed` by a path."""
+    defaults = fields.list_defaults(type(plugin))
+    try:
+        return name in defaults and bool(dataclasses.replace(plugin, **{name: defaults[name]}) == plugin)  # type: ignore[type-var]
+    except UserError:  # the default does not suit the other fields
+        return False
 
 
 def _to_text(value: Any) -> str:

@@ -24,6 +24,7 @@ from bench.extractors.disk import Disk
 from bench.extractors.xfeat import XFeat
 from bench.formats import pretrained
 from bench.images.photographs import list_builtin
+from bench.registry import spec
 from bench.types import Features, Floats
 
 pytest.importorskip("kornia", minversion="0.9")
@@ -50,6 +51,15 @@ def build(plugin: type[Extractor], given: dict[str, Any]) -> Any:
 
 def read(number: int, width: int = 256, height: int = 256) -> np.ndarray:
     return cv2.resize(PHOTOGRAPHS[number](), (width, height), interpolation=cv2.INTER_AREA)
+
+
+@EVERY
+def test_the_text_of_an_extractor_names_no_installed_file(plugin: type[Extractor], given: dict[str, Any], tmp_path: Path) -> None:
+    extractor = build(plugin, given)
+    changed = [f"variant={variant}" for variant in given.values() if variant != "n16"]
+    assert spec.to_text(extractor) == ":".join([plugin.name(), *changed])
+    copy = shutil.copy(extractor.weights, tmp_path / "copy.pt")
+    assert f"weights={copy}" in spec.to_text(plugin(**given, weights=copy))
 
 
 # ---- upstream
