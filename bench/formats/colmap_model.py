@@ -75,7 +75,8 @@ def _read_text_cameras(path: Path) -> dict[str, pycolmap.Camera]:
 
 def _read_text_images(path: Path, cameras: dict[str, pycolmap.Camera]) -> Iterator[tuple[str, PosedImage]]:
     lines = lists.read_lines(path)
-    count, announced = 0, None
+    identifiers: set[str] = set()
+    announced = None
     for number, line in lines:
         where, text = f"{path}:{number}", line.strip()
         if match := COUNT.match(text):
@@ -85,15 +86,17 @@ def _read_text_images(path: Path, cameras: dict[str, pycolmap.Camera]) -> Iterat
         fields = text.split(maxsplit=9)
         if len(fields) != 10:
             raise UserError(f"{where}: {IMAGE}, but there are {len(fields)}")
+        if fields[0] in identifiers:
+            raise UserError(f"{where}: image {lists.shorten(fields[0])} occurs a second time")
+        identifiers.add(fields[0])
         pose = _build_pose(lists.parse_numbers(fields[1:8], where), where)
         if fields[8] not in cameras:
             raise UserError(f"{where}: there is no camera {lists.shorten(fields[8])} in {path.with_name('cameras.txt')}")
         number, line = next(lines, (number, ""))
         if not _is_points(line):
             raise UserError(f"{path}:{number}: {POINTS}, not {lists.shorten(line.strip())!r}")
-        count += 1
         yield fields[9], (where, cameras[fields[8]], pose)
-    if announced not in (None, count):
+    if announced not in (None, count := len(identifiers)):
         raise UserError(f"{path}: its comment announces {announced} images, but there are {count}; correct or remove the comment")
 
 
@@ -165,12 +168,16 @@ def _read_binary_cameras(path: Path) -> dict[int, pycolmap.Camera]:
 def _read_binary_images(path: Path, cameras: dict[int, pycolmap.Camera]) -> Iterator[tuple[str, PosedImage]]:
     opened = _Binary(path)
     (count,) = opened.take("Q", "its header")
+    numbers: set[int] = set()
     for index in range(count):
         number, *pose, camera = opened.take("I7dI", f"image {index + 1} of {count}")
         where = f"{path}, image {number}"
         name = opened.take_name(f"image {number}")
         (points,) = opened.take("Q", f"image {number}")
         opened.skip(points * POINT_BYTES, f"the points of image {number}")
+        if number in numbers:
+            raise UserError(f"{where}: occurs a second time")
+        numbers.add(number)
         if camera not in cameras:
             raise UserError(f"{where}: there is no camera {camera} in {path.with_name('cameras.bin')}")
         values = np.array(pose)

@@ -190,7 +190,8 @@ def parse_rotation(wxyz: np.ndarray, where: str) -> pycolmap.Rotation3d:
     """Return the rotation of a unit quaternion (4,) w x y z; raise UserError if its norm is not 1."""
     import pycolmap
 
-    norm = float(np.linalg.norm(wxyz))
+    with np.errstate(over="ignore"):  # then the norm is infinite
+        norm = float(np.linalg.norm(wxyz))
     if abs(norm - 1) > ROUNDING:
         raise UserError(f"{where}: the quaternion {_format_numbers(wxyz)} has norm {norm:.6g}, not 1")
     return pycolmap.Rotation3d(np.roll(wxyz, -1) / norm)

@@ -163,6 +163,7 @@ def test_lost_images_are_counted(text: Path) -> None:
         ("cameras", "80 64", "٨٠ 64", "width and height must be whole numbers"),
         ("cameras", "\n2 ", "\n1 ", r"cameras\.txt:5: camera 1 occurs a second time"),
         ("images", "db/2.png", "db/1.png", r"images\.txt:7: db/1\.png is in this model twice"),
+        ("images", "\n2 ", "\n1 ", r"images\.txt:7: image 1 occurs a second time"),
     ],
 )
 def test_damaged_text_is_refused_by_line(text: Path, file: str, old: str, new: str, complaint: str) -> None:
@@ -191,6 +192,8 @@ def test_byte_order_marks_are_ignored(text: Path) -> None:
         ("images", 8 + 60, "I", 9, r"images\.bin, image 1: there is no camera 9 in .*cameras\.bin"),
         ("images", 8 + 4, "d", float("nan"), r"images\.bin, image 1: the pose of db/1\.png is not finite"),
         ("images", 8 + 4, "d", 3.0, r"images\.bin, image 1: the quaternion .* has norm"),
+        ("images", 8 + 4, "d", 1e300, r"images\.bin, image 1: the quaternion .* has norm inf, not 1"),
+        ("images", 8, "I", 2, r"images\.bin, image 2: occurs a second time"),
         ("images", 8 + BINARY_IMAGE, "B", 255, r"the name of image 1 is not UTF-8"),
         ("images", 8 + BINARY_IMAGE + len("db/1.png") + 1, "Q", 2**61, "it ends within the points of image 1"),
         ("cameras", 0, "Q", 2**64 - 1, r"cameras\.bin: not a whole COLMAP model: it ends within camera 3 of 1844"),
