@@ -126,13 +126,9 @@ def _list_defaults(plugin: type[Plugin]) -> dict[str, Any]:
 
 
 def _format_value(value: Any) -> str:
-    if value is None or isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, float):
-        return repr(float(value)).removesuffix(".0")
-    if str(value).startswith("sha256:"):
-        return _index_shipped().get(str(value), "FILE")
-    return str(value)
+    """Return the value of a field in a record as an option of a command takes it: the name of a shipped file, or FILE."""
+    text = spec.format_value(value)
+    return _index_shipped().get(text, "FILE") if text.startswith("sha256:") else text
 
 
 @functools.cache

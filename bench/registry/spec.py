@@ -124,7 +124,7 @@ def to_text(plugin: Plugin) -> str:
     if isinstance(plugin, Composed):
         return "+".join(map(to_text, plugin.parts))
     changed = [name for name in fields.resolve_types(type(plugin)) if not _is_default(plugin, name)]
-    given = ",".join(f"{name}={_to_text(getattr(plugin, name))}" for name in changed)
+    given = ",".join(f"{name}={format_value(getattr(plugin, name))}" for name in changed)
     return f"{plugin.name()}:{given}" if given else plugin.name()
 
 
@@ -137,9 +137,13 @@ def _is_default(plugin: Plugin, name: str) -> bool:
         return False
 
 
-def _to_text(value: Any) -> str:
-    text = str(value)
-    return text.lower() if isinstance(value, bool) else text.removesuffix(".0") if isinstance(value, float) else text
+def format_value(value: Any) -> str:
+    """Return the value of a field as `read` takes it."""
+    if value is None or isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, float):
+        return repr(float(value)).removesuffix(".0")
+    return str(value)
 
 
 def encode_infinity(value: float | None) -> float | str | None:
